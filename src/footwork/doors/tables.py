@@ -1,0 +1,98 @@
+"""Tables for a terminal, plain where there is none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from footwork.arena import DIRECTIONS
+from footwork.tasks.task import SUCCESS_RADII
+from footwork.train import Experiment
+
+
+def show(*tables: Table) -> None:
+    """Print tables to standard output; a pipe gets all columns, uncut."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=200)
+    for table in tables:
+        console.print(table)
+
+
+def rows_table(experiments: list[Experiment], found: dict[str, str]) -> Table:
+    """What each row trains, on what, and whether trained policies are at hand."""
+    table = Table(title="rows", title_justify="left")
+    for column in ("row", "trains", "task", "needs", "S", "k", "control steps", "trained"):
+        table.add_column(column, justify="right" if column in ("S", "k", "control steps") else "left", no_wrap=True)
+    for row in experiments:
+        kind = "master" if row.is_master else "sub-policies" if row.is_walker else "flat policy"
+        table.add_row(
+            row.name,
+            kind,
+            row.task.name,
+            row.needs or "",
+            str(row.ppo.batch_size),
+            str(row.option_steps) if row.is_master else "",
+            f"{row.total_steps:,}" + (" x 4" if row.runs_per_seed > 1 else ""),
+            found[row.name],
+        )
+    return table
+
+
+def evaluation_table(reports: list[dict[str, Any]]) -> Table:
+    """Rows side by side, rates in per cent with their 95 % intervals."""
+    walkers = all(report["success"] is None for report in reports)
+    table = Table(title="evaluation (95 % intervals in brackets)", title_justify="left")
+    table.add_column("row", no_wrap=True)
+    table.add_column("episodes", justify="right")
+    names = [f"m/s {name}" for name in DIRECTIONS] if walkers else [f"within {radius} m" for radius in SUCCESS_RADII]
+    for name in (*names, "fall", "flip", "progress m", "time to goal s"):
+        table.add_column(name, justify="right")
+    for report in reports:
+        interval = report["interval"]
+        if walkers:
+            cells = [f"{sum(speeds) / len(speeds):.2f}" for speeds in report["speed_mps"].values()]
+        elif report["success"] is None:
+            cells = ["-" for _ in SUCCESS_RADII]
+        else:
+            cells = [_rate(report["success"][r], interval["success"][r]) for r in report["success"]]
+        table.add_row(
+            report["row"],
+            str(report["episodes"]),
+            *cells,
+            _rate(report["fall_rate"], interval["fall_rate"]),
+            _rate(report["flip_rate"], interval["flip_rate"]),
+            f"{report['progress_m']:.2f}",
+            "-" if report["time_to_goal_s"] is None else f"{report['time_to_goal_s']:.1f}",
+        )
+    return table
+
+
+def handover_table(report: dict[str, Any]) -> Table:
+    """Who hands over to whom: speed after, falls, flips."""
+    table = Table(title=f"{report['row']}: hand-over, m/s after (fall %, flip %)", title_justify="left")
+    table.add_column("from \\ to")
+    for name in DIRECTIONS:
+        table.add_column(name, justify="right")
+    for name, row in zip(DIRECTIONS, report["handover"], strict=True):
+        cells = (f"{c['speed_mps']:.2f} ({100 * c['fall']:.0f}, {100 * c['flip']:.0f})" for c in row)
+        table.add_row(name, *cells)
+    return table
+
+
+def switching_table(reports: list[dict[str, Any]]) -> Table:
+    """Random switching, one line per row and period."""
+    table = Table(title="random switching for 2000 control steps", title_justify="left")
+    for column in ("row", "k", "m/s per option", "idle %", "upside down %", "fallen %"):
+        table.add_column(column, justify="left" if column == "row" else "right", no_wrap=True)
+    for report in reports:
+        for k, figures in report["switching"].items():
+            shares = (f"{100 * figures[name]:.1f}" for name in ("idle", "upside_down", "fallen"))
+            table.add_row(report["row"], k, f"{figures['speed_mps']:.2f}", *shares)
+    return table
+
+
+def _rate(rate: float, interval: list[float]) -> str:
+    return f"{100 * rate:.1f} [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"

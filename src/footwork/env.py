@@ -1,0 +1,181 @@
+"""Environments: a task on a physics engine, and the protocol that every wrapper keeps.
+
+A step has three phases, so that everything but the engine is pure and is compiled
+into two calls per control step, however many wrappers there are:
+
+* ``begin(state, action, key)``   pure: decides what the ants will do
+* ``simulate(state, key)``        the engine moves; on a C engine this is host code
+* ``finish(state, key)``          pure: rewards, ends, observations
+
+Nothing resets by itself: a row whose episode ended is held, costs nothing and earns
+nothing until ``restart`` begins its next episode. The engine learns of a restart
+lazily, at its next step: ``stale`` marks the rows it must overwrite first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from footwork.tasks.task import Task
+from footwork.types import Array, Bool, Float, Int, Key, Physics, PhysicsState, TimeStep
+
+
+class Environment(Protocol):
+    """What Env, its wrappers and Options have in common. ``state`` is a pytree of the environment's own."""
+
+    num_envs: int
+    physics: Physics
+
+    def initial(self, key: Key) -> tuple[Any, Array]:
+        """A first episode in every row: (state, obs [N, D])."""
+
+    def begin(self, state: Any, action: Array, key: Key) -> Any:
+        """Take the policy's action, pure."""
+
+    def simulate(self, state: Any, key: Key) -> Any:
+        """Let the engine move."""
+
+    def finish(self, state: Any, key: Key) -> tuple[Any, TimeStep]:
+        """What the step brought, pure."""
+
+    def restart(self, state: Any, mask: Bool[Array, " N"], key: Key) -> tuple[Any, Array]:
+        """Begin a new episode in the masked rows, pure: (state, obs [N, D])."""
+
+
+class EnvState(NamedTuple):
+    """N ants on one task."""
+
+    physics: PhysicsState
+    previous: PhysicsState  # before the last control step
+    action: Float[Array, "N 8"]
+    goal: Float[Array, "N 2"]  # m
+    t: Int[Array, " N"]  # control steps of this episode so far
+    held: Bool[Array, " N"]  # the episode has ended and no new one has begun
+    stale: Bool[Array, " N"]  # the engine has yet to be told of this row's restart
+
+
+@dataclass(frozen=True, eq=False)
+class Env:
+    """Task x Physics.
+
+    Args:
+        task: what is observed, rewarded and ended.
+        physics: the engine, with the task's arena in it.
+        goal_index: [N], the goal of each row among the task's; None: drawn anew in every episode.
+    """
+
+    task: Task
+    physics: Physics
+    goal_index: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.goal_index is not None and len(self.goal_index) != self.num_envs:
+            raise ValueError(f"goal_index must have one entry per row, got {len(self.goal_index)} for {self.num_envs}")
+
+    @property
+    def num_envs(self) -> int:
+        """N."""
+        return self.physics.num_envs
+
+    def initial(self, key: Key) -> tuple[EnvState, Array]:
+        """All rows at the start of an episode."""
+        physics = jax.tree.map(jnp.asarray, self.physics.initial())
+        off = jnp.zeros(self.num_envs, bool)
+        state = EnvState(
+            physics=physics,
+            previous=physics,
+            action=jnp.zeros((self.num_envs, 8)),
+            goal=jnp.zeros((self.num_envs, 2)),
+            t=jnp.zeros(self.num_envs, jnp.int32),
+            held=off,
+            stale=off,
+        )
+        return self.restart(state, ~off, key)
+
+    def begin(self, state: EnvState, action: Array, key: Key) -> EnvState:
+        """Hand the action to the engine, as the policy gave it."""
+        return state._replace(action=action)
+
+    def simulate(self, state: EnvState, key: Key) -> EnvState:
+        """One control step of the rows that are not held."""
+        physics = self.physics.reset(state.physics, state.stale, state.physics.qpos, state.physics.qvel)
+        if self.physics.traceable:
+            moved = self.physics.step(physics, state.action, ~state.held)
+        else:
+            held = np.asarray(state.held)
+            moved = self.physics.step(physics, state.action, ~held if held.any() else None)
+        return state._replace(physics=moved, previous=physics, stale=np.zeros_like(state.stale))
+
+    def finish(self, state: EnvState, key: Key) -> tuple[EnvState, TimeStep]:
+        """Reward and end of the step; a held row earns nothing and ends nothing."""
+        active = ~state.held
+        t = state.t + active
+        step = self.task.advance(state.previous, state.action, state.physics, state.goal, t)
+        step = step._replace(
+            reward=step.reward * active,
+            terms={name: value * active for name, value in step.terms.items()},
+            terminated=step.terminated & active,
+            truncated=step.truncated & active,
+            valid=step.valid & active,
+        )
+        done = step.terminated | step.truncated
+        return state._replace(t=t, held=state.held | done), step
+
+    def restart(self, state: EnvState, mask: Bool[Array, " N"], key: Key) -> tuple[EnvState, Array]:
+        """A new episode in the masked rows, airborne: no foot touches anything yet."""
+        pose_key, goal_key = jax.random.split(key)
+        qpos, qvel = self.task.reset_pose(pose_key, self.num_envs)
+        if self.goal_index is None:
+            index = jax.random.randint(goal_key, (self.num_envs,), 0, len(self.task.goals))
+        else:
+            index = jnp.array(self.goal_index)
+        goal = jnp.where(mask[:, None], jnp.asarray(self.task.goals)[index], state.goal)
+        old = state.physics
+        physics = old._replace(
+            qpos=jnp.where(mask[:, None], qpos, old.qpos),
+            qvel=jnp.where(mask[:, None], qvel, old.qvel),
+            foot_contact=jnp.where(mask[:, None], 0.0, old.foot_contact),
+            foot_collision=jnp.where(mask[:, None], 0.0, old.foot_collision),
+            diverged=old.diverged & ~mask,
+        )
+        state = state._replace(
+            physics=physics,
+            goal=goal,
+            t=jnp.where(mask, 0, state.t),
+            held=state.held & ~mask,
+            stale=state.stale | mask,
+        )
+        return state, self.task.observe(physics, goal)
+
+
+def split_phases(key: Key) -> tuple[Key, Key, Key]:
+    """Keys for the three phases of a step."""
+    begin, simulate, finish = jax.random.split(key, 3)
+    return begin, simulate, finish
+
+
+def step(env: Environment, state: Any, action: Array, key: Key) -> tuple[Any, TimeStep]:
+    """One whole step of any environment."""
+    begin_key, simulate_key, finish_key = split_phases(key)
+    state = env.begin(state, action, begin_key)
+    state = env.simulate(state, simulate_key)
+    return env.finish(state, finish_key)
+
+
+def host_scan(body: Any, carry: Any, xs: Any) -> tuple[Any, Any]:
+    """``lax.scan``'s contract as a Python loop, for bodies that step a C engine; outputs are stacked as numpy."""
+    outputs = []
+    for i in range(len(jax.tree.leaves(xs)[0])):
+        carry, y = body(carry, jax.tree.map(lambda leaf, i=i: leaf[i], xs))
+        outputs.append(y)
+    return carry, jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *outputs)
+
+
+def scan_over(physics: Physics) -> Any:
+    """The loop that a body stepping ``physics`` runs under."""
+    return jax.lax.scan if physics.traceable else host_scan

@@ -1,0 +1,389 @@
+"""Evaluate: success, falls and progress of a row; hand-overs and random switching of sub-policies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from footwork.arena import DIRECTIONS, open_field
+from footwork.env import Env, Environment, split_phases
+from footwork.learn.networks import Policy
+from footwork.options import Options, OptionsState, SubPolicies
+from footwork.physics.batch import BatchPhysics
+from footwork.regularisers import directions_of_rows
+from footwork.tasks.task import SUCCESS_RADII, Task
+from footwork.train import Experiment, Trained
+from footwork.types import Array, Key, Params
+
+IDLE_SPEED = 0.2  # m/s; an option slower than this has not moved the ant
+SWITCHING_STEPS = 2000  # control steps of random switching
+SWITCHING_PERIODS = (25, 50, 100, 200)  # control steps per option
+HANDOVER_AFTER = (100, 200)  # control steps of the first policy, uniform in this range in multiples of the segment
+HANDOVER_STEPS = 300  # control steps of the second
+_SEGMENT = 25  # control steps between two looks
+_NUM_DIRECTIONS = len(DIRECTIONS)
+_UNIT = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)  # of the directions, world frame
+
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """One episode per row, and what its path was.
+
+    All arrays have a leading row axis; ``paths`` is [decisions + 1, N, 2] in m and
+    ``choices`` [decisions, N], of master rows only.
+    """
+
+    closest: np.ndarray  # m, to the goal
+    fallen: np.ndarray
+    flipped: np.ndarray
+    progress: np.ndarray  # m, of the potential
+    distance: np.ndarray  # return in the distance part of the reward
+    time_to_goal: np.ndarray  # s; NaN where the goal was not reached
+    paths: np.ndarray
+    choices: np.ndarray
+    ended: np.ndarray  # [decisions, N], the row's episode was over before this decision
+
+
+def evaluation_environment(
+    experiment: Experiment, num_envs: int, needed: SubPolicies | None, num_threads: int = 0
+) -> Environment:
+    """The row's task without resets; an episode goes on until the smallest success radius."""
+    task = experiment.task
+    if task.goal_radius is not None:
+        task = replace(task, goal_radius=min(*SUCCESS_RADII, task.goal_radius))
+    physics = BatchPhysics(task.robot, task.arena, num_envs, num_threads)
+    if experiment.is_walker:
+        return Env(task, physics, directions_of_rows(num_envs, range(_NUM_DIRECTIONS)))
+    env = Env(task, physics)
+    return env if needed is None else Options(env, needed, experiment.option_steps)
+
+
+def play_episodes(
+    trained: Trained,
+    sub_policies: SubPolicies | None,
+    num_episodes: int,
+    seed: int,
+    seed_index: int = 0,
+    deterministic: bool = False,
+    num_threads: int = 0,
+) -> Episodes:
+    """Play ``num_episodes`` episodes of one seed's policy, all at once."""
+    experiment = trained.experiment
+    env = evaluation_environment(experiment, num_episodes, sub_policies, num_threads)
+    act = _actor(trained, seed_index, env, deterministic)
+    stride = experiment.option_steps if experiment.is_master else 1
+    num_decisions = math.ceil(experiment.task.episode_steps / stride)
+    key = jax.random.key(seed)
+    state, obs = env.initial(jax.random.fold_in(key, 0))
+    goal_radius, dt = experiment.task.goal_radius or 0.0, stride * experiment.task.robot.control_dt
+    steps, paths, ended = [], [_positions(state)], []
+    for i in range(num_decisions):
+        ended.append(np.asarray(_inner(state).held))
+        if ended[-1].all():
+            ended.pop()
+            break
+        state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
+        state = env.simulate(state, simulate_key)
+        state, step = _finish(env, state, finish_key)
+        obs = step.obs
+        keep = (step.events, step.terms["progress"], action if experiment.is_master else ())
+        steps.append(jax.tree.map(np.asarray, keep))
+        if i % max(1, 10 // stride) == 0 or experiment.is_master:
+            paths.append(_positions(state))
+    events, progress, choices = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
+    over = np.stack(ended)
+    counts = lambda name: (events[name] & ~over).any(axis=0)  # noqa: E731
+    distance = np.where(over, np.inf, events["goal_distance"])
+    arrival = np.where((distance <= goal_radius).any(axis=0), (distance <= goal_radius).argmax(axis=0) + 1.0, np.nan)
+    return Episodes(
+        closest=distance.min(axis=0),
+        fallen=counts("fallen"),
+        flipped=counts("flipped"),
+        progress=progress.sum(axis=0) * experiment.task.robot.control_dt,
+        distance=progress.sum(axis=0),
+        time_to_goal=arrival * dt,
+        paths=np.stack(paths),
+        choices=choices if experiment.is_master else np.zeros((0, num_episodes), np.int32),
+        ended=over,
+    )
+
+
+def _actor(trained: Trained, seed_index: int, env: Environment, deterministic: bool) -> Any:
+    """The jitted first call of a step: the policy under test, and the environment's begin."""
+    params = jax.tree.map(lambda leaf: leaf[seed_index], trained.params)
+    experiment = trained.experiment
+    if experiment.is_walker:
+        walkers = trained.sub_policies(seed_index, deterministic)
+        direction = jnp.array(env.goal_index)  # type: ignore[attr-defined]
+        choose: Any = lambda obs, key: walkers.act(obs, direction, key)  # noqa: E731
+    else:
+        single = jax.tree.map(lambda leaf: leaf[0], params)
+        choose = partial(_choose, experiment.policy(), single, deterministic)
+
+    @jax.jit
+    def act(state: Any, obs: Array, key: Key, i: Array) -> Any:
+        act_key, env_key = jax.random.split(jax.random.fold_in(key, i))
+        begin_key, simulate_key, finish_key = split_phases(env_key)
+        action = choose(obs, act_key)
+        return env.begin(state, action, begin_key), action, simulate_key, finish_key
+
+    return act
+
+
+def _choose(policy: Policy, params: Params, deterministic: bool, obs: Array, key: Key) -> Array:
+    return policy.mode(params, obs) if deterministic else policy.act(params, obs, key)[0]
+
+
+@partial(jax.jit, static_argnums=0)
+def _finish(env: Environment, state: Any, key: Key) -> Any:
+    return env.finish(state, key)
+
+
+def _inner(state: Any) -> Any:
+    return state.inner if isinstance(state, OptionsState) else state
+
+
+def _positions(state: Any) -> np.ndarray:
+    return np.asarray(_inner(state).physics.qpos)[:, :2].copy()
+
+
+def evaluate(
+    trained: Trained,
+    needed: Trained | None,
+    num_episodes: int = 1000,
+    seed: int = 1_000_003,
+    deterministic: bool = False,
+    num_threads: int = 0,
+) -> dict[str, Any]:
+    """Figures of a row over ``num_episodes`` episodes of each of its seeds, with 95 % intervals.
+
+    Success is judged at several radii from the closest approach: ``inf`` radii are
+    no use to a walker, whose success is None.
+    """
+    experiment = trained.experiment
+    episodes = []
+    for index in range(len(trained.seeds)):
+        subs = None
+        if experiment.is_master and needed is not None:
+            subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
+        episodes.append(play_episodes(trained, subs, num_episodes, seed + index, index, deterministic, num_threads))
+    closest = np.concatenate([e.closest for e in episodes])
+    fallen, flipped = (np.concatenate([getattr(e, name) for e in episodes]) for name in ("fallen", "flipped"))
+    progress, arrival = (np.concatenate([getattr(e, name) for e in episodes]) for name in ("progress", "time_to_goal"))
+    arrival = arrival[np.isfinite(arrival)]
+    success = None if experiment.is_walker else {str(radius): closest <= radius for radius in SUCCESS_RADII}
+    report: dict[str, Any] = {
+        "row": experiment.name,
+        "seeds": list(trained.seeds),
+        "episodes": int(closest.size),
+        "success": None if success is None else {radius: float(hit.mean()) for radius, hit in success.items()},
+        "fall_rate": float(fallen.mean()),
+        "flip_rate": float(flipped.mean()),
+        "progress_m": float(progress.mean()),
+        "time_to_goal_s": float(arrival.mean()) if arrival.size else None,
+        "interval": {
+            "success": None if success is None else {radius: wilson(hit) for radius, hit in success.items()},
+            "fall_rate": wilson(fallen),
+            "flip_rate": wilson(flipped),
+            "progress_m": bootstrap_mean(progress, seed),
+            "time_to_goal_s": bootstrap_mean(arrival, seed) if arrival.size else None,
+        },
+        "source": trained.source,
+    }
+    if experiment.is_walker:
+        report["speed_mps"] = _speed_by_direction(experiment, episodes)
+    return report
+
+
+def _speed_by_direction(experiment: Experiment, episodes: list[Episodes]) -> dict[str, list[float]]:
+    """Mean speed over the whole episode time, per direction: one entry per seed. Time after a fall counts."""
+    seconds = experiment.task.episode_steps * experiment.task.robot.control_dt
+    blocks = [np.split(e.progress, _NUM_DIRECTIONS) for e in episodes]
+    return {
+        name: [float(block[direction].mean() / seconds) for block in blocks]
+        for direction, name in enumerate(DIRECTIONS)
+    }
+
+
+def wilson(hits: np.ndarray) -> list[float]:
+    """95 % interval of a rate (Wilson 1927), which stays honest at 0 and at 1."""
+    n, z = max(hits.size, 1), 1.959964
+    rate = hits.mean() if hits.size else 0.0
+    middle = (rate + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    return [float(max(middle - half, 0.0)), float(min(middle + half, 1.0))]
+
+
+def bootstrap_mean(values: np.ndarray, seed: int, draws: int = 1000) -> list[float]:
+    """95 % percentile-bootstrap interval of a mean."""
+    generator = np.random.default_rng(seed)
+    means = [generator.choice(values, values.size).mean() for _ in range(draws)]
+    return [float(bound) for bound in np.percentile(means, (2.5, 97.5))]
+
+
+def switching_task(task: Task) -> Task:
+    """An open field where nothing ends an episode, for tests of hand-overs."""
+    return replace(task, arena=open_field(), fall_rule="none", goal_radius=None, episode_steps=1_000_000)
+
+
+@dataclass(frozen=True, eq=False)
+class _Walk:
+    """Ants driven by chosen sub-policies in segments of a few control steps."""
+
+    env: Options
+    key: Key
+
+    def start(self) -> OptionsState:
+        state, _ = self.env.initial(jax.random.fold_in(self.key, 0))
+        return state
+
+    def run(self, state: OptionsState, choice: np.ndarray, segment: int) -> tuple[OptionsState, Any]:
+        """One segment: the state after it and what was counted."""
+        begin, simulate, finish = split_phases(jax.random.fold_in(self.key, 1 + segment))
+        state = self.env.simulate(self.env.begin(state, jnp.asarray(choice), begin), simulate)
+        state, step = _finish(self.env, state, finish)
+        return state, step.events
+
+
+def _walk(sub_policies: SubPolicies, task: Task, num_envs: int, seed: int, num_threads: int) -> _Walk:
+    task = switching_task(task)
+    env = Env(task, BatchPhysics(task.robot, task.arena, num_envs, num_threads), (0,) * num_envs)
+    return _Walk(Options(env, sub_policies, _SEGMENT), jax.random.key(seed))
+
+
+def handover_matrix(
+    sub_policies: SubPolicies, task: Task, ants: int = 64, seed: int = 0, num_threads: int = 0
+) -> list[list[dict[str, float]]]:
+    """Run i for 100 to 200 control steps, then j for 300: entry [i][j] has fall and flip rate and the speed after.
+
+    ``ants`` per pair. A fall or flip counts from the hand-over on; the speed is along j over all 300 steps.
+    """
+    first, second = np.meshgrid(np.arange(_NUM_DIRECTIONS), np.arange(_NUM_DIRECTIONS), indexing="ij")
+    first, second = (np.repeat(grid.reshape(-1), ants).astype(np.int32) for grid in (first, second))
+    low, high = (steps // _SEGMENT for steps in HANDOVER_AFTER)
+    switch = np.random.default_rng(seed).integers(low, high + 1, first.size)
+    walk = _walk(sub_policies, task, first.size, seed, num_threads)
+    state, after = walk.start(), HANDOVER_STEPS // _SEGMENT
+    fell, flipped = np.zeros(first.size, bool), np.zeros(first.size, bool)
+    at_switch, at_end = np.zeros((first.size, 2)), np.zeros((first.size, 2))
+    for segment in range(high + after):
+        position = _positions(state)
+        at_switch = np.where((segment == switch)[:, None], position, at_switch)
+        state, events = walk.run(state, np.where(segment < switch, first, second), segment)
+        counted = (segment >= switch) & (segment < switch + after)
+        fell |= np.asarray(events["fallen"]) & counted
+        flipped |= np.asarray(events["flipped"]) & counted
+        at_end = np.where((segment == switch + after - 1)[:, None], _positions(state), at_end)
+    seconds = HANDOVER_STEPS * task.robot.control_dt
+    speed = np.sum((at_end - at_switch) * _UNIT[second], axis=1) / seconds
+    by_pair = [array.reshape(_NUM_DIRECTIONS, _NUM_DIRECTIONS, ants).mean(axis=2) for array in (fell, flipped, speed)]
+    return [
+        [
+            {"fall": float(by_pair[0][i, j]), "flip": float(by_pair[1][i, j]), "speed_mps": float(by_pair[2][i, j])}
+            for j in range(_NUM_DIRECTIONS)
+        ]
+        for i in range(_NUM_DIRECTIONS)
+    ]
+
+
+def random_switching(
+    sub_policies: SubPolicies,
+    task: Task,
+    option_steps: int,
+    ants: int = 256,
+    seed: int = 0,
+    orthogonal: bool = False,
+    num_threads: int = 0,
+) -> dict[str, float]:
+    """2000 control steps in which every ant draws a new direction every ``option_steps``.
+
+    The draw is uniform over the other three directions, or over the two orthogonal ones.
+    Speed is along the direction of each option, over all options after the first; an option under
+    0.2 m/s is idle. ``upside_down`` and ``fallen`` (by height) are shares at the end.
+    """
+    if option_steps % _SEGMENT:
+        raise ValueError(f"option_steps must be a multiple of {_SEGMENT}, got {option_steps}")
+    generator = np.random.default_rng(seed)
+    walk = _walk(sub_policies, task, ants, seed, num_threads)
+    state, choice = walk.start(), generator.integers(0, _NUM_DIRECTIONS, ants)
+    per_option, speeds, events = option_steps // _SEGMENT, [], {}
+    for option in range(SWITCHING_STEPS // option_steps):
+        if option:
+            turn = generator.choice((1, 3), ants) if orthogonal else generator.integers(1, _NUM_DIRECTIONS, ants)
+            choice = (choice + turn) % _NUM_DIRECTIONS
+        before = _positions(state)
+        for segment in range(per_option):
+            state, events = walk.run(state, choice.astype(np.int32), option * per_option + segment)
+        moved = np.sum((_positions(state) - before) * _UNIT[choice], axis=1)
+        speeds.append(moved / (option_steps * task.robot.control_dt))
+    after_first = np.stack(speeds[1:])
+    qpos = np.asarray(state.inner.physics.qpos)
+    return {
+        "speed_mps": float(after_first.mean()),
+        "idle": float((after_first < IDLE_SPEED).mean()),
+        "upside_down": float(_upside_down(qpos).mean()),
+        "fallen": float((qpos[:, 2] <= task.robot.fall_height).mean()),
+    }
+
+
+def _upside_down(qpos: np.ndarray) -> np.ndarray:
+    return 1.0 - 2.0 * (qpos[:, 4] ** 2 + qpos[:, 5] ** 2) < 0.0
+
+
+def transitions(
+    trained: Trained,
+    ants: int = 256,
+    seed: int = 1_000_003,
+    deterministic: bool = False,
+    num_threads: int = 0,
+    periods: tuple[int, ...] = SWITCHING_PERIODS,
+    report: Report = lambda line: None,
+) -> dict[str, Any]:
+    """The hand-over matrix and random switching of a row's sub-policies, as means over its seeds.
+
+    Raises:
+        ValueError: the row trains no sub-policies.
+    """
+    task = trained.experiment.task
+    if not trained.experiment.is_walker:
+        raise ValueError(f"transitions are measured on sub-policies (walker/...), not on {trained.experiment.name}")
+    matrices, switching = [], {str(k): [] for k in periods}
+    for index in range(len(trained.seeds)):
+        subs = trained.sub_policies(index, deterministic)
+        report(f"seed {trained.seeds[index]}: hand-over matrix")
+        matrices.append(handover_matrix(subs, task, max(1, ants // 4), seed + index, num_threads))
+        for k in periods:
+            report(f"seed {trained.seeds[index]}: random switching, k = {k}")
+            switching[str(k)].append(random_switching(subs, task, k, ants, seed + index, num_threads=num_threads))
+    mean = lambda *values: float(np.mean(values))  # noqa: E731
+    return {
+        "row": trained.experiment.name,
+        "seeds": list(trained.seeds),
+        "handover": jax.tree.map(mean, *matrices),
+        "switching": {k: jax.tree.map(mean, *results) for k, results in switching.items()},
+        "switching_by_seed": switching,
+        "source": trained.source,
+    }
+
+
+__all__ = [
+    "Episodes",
+    "bootstrap_mean",
+    "evaluate",
+    "evaluation_environment",
+    "handover_matrix",
+    "play_episodes",
+    "random_switching",
+    "switching_task",
+    "transitions",
+    "wilson",
+]

@@ -1,0 +1,1 @@
+"""The learner: networks, advantages and PPO. It knows arrays and no environment."""

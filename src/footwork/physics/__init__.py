@@ -1,0 +1,1 @@
+"""The engines that step the ant, behind one protocol (:class:`footwork.types.Physics`)."""

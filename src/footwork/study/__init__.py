@@ -1,0 +1,1 @@
+"""The study: the table of experiments, and what is measured and drawn from it."""

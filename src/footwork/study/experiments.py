@@ -1,0 +1,119 @@
+"""The table: every row that Footwork trains. A row's name is its address, its folder and its legend.
+
+Rows are data. Training, evaluation, packaged weights and smoke tests are derived from
+:data:`EXPERIMENTS`; Table 1 of the paper stands once, in ``footwork.learn.config.PAPER``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from footwork.arena import MAZES, Arena, bandit, maze, open_field
+from footwork.learn.config import PAPER, PPOConfig
+from footwork.regularisers import AppropriateBias, Interleaved, RandomRepeated, RandomStart
+from footwork.robot import HEAVY, Robot
+from footwork.tasks.task import Task
+from footwork.tasks.terms import FREE_WEIGHTS, PENALISED_WEIGHTS, WALKER_WEIGHTS
+from footwork.train import Experiment
+
+ANT_WALKER = Task("AntWalker", HEAVY, open_field(), WALKER_WEIGHTS)
+ANT_BANDIT = Task(
+    "AntBandit", HEAVY, bandit(), FREE_WEIGHTS, observe_xy=True, observe_goal=True, fall_rule="none", goal_radius=0.5
+)
+ANT_MAZE = Task("AntMaze", HEAVY, MAZES["u"], FREE_WEIGHTS, observe_xy=True, fall_rule="none", goal_radius=0.5)
+
+WALKER_STEPS = 2_000_000  # control steps per direction; not in the paper
+FLAT_STEPS = 10_000_000  # as many as four sub-policies and a master together
+
+# The master learns from few decisions: more rows and larger batches than Table 2's S = 128 and 40.
+MASTER_PPO = replace(PAPER, num_envs=64, num_steps=8, num_minibatches=8)
+# Table 2's S, read as 8 rows side by side.
+PAPER_MASTER_MAZE = replace(PAPER, num_envs=8, num_steps=16)
+PAPER_MASTER_BANDIT = replace(PAPER, num_envs=8, num_steps=5)
+
+WALKERS: tuple[Experiment, ...] = (
+    Experiment("walker/plain", ANT_WALKER, PAPER, WALKER_STEPS),
+    Experiment("walker/random-start", ANT_WALKER, PAPER, WALKER_STEPS, RandomStart()),
+    Experiment("walker/random-repeated", ANT_WALKER, PAPER, WALKER_STEPS, RandomRepeated()),
+    Experiment("walker/appropriate-bias", ANT_WALKER, PAPER, WALKER_STEPS, AppropriateBias()),
+    Experiment("walker/interleaved", replace(ANT_WALKER, fall_rule="either"), PAPER, WALKER_STEPS, Interleaved()),
+    Experiment("walker/symmetric", ANT_WALKER, PAPER, WALKER_STEPS, symmetric=True),
+    Experiment(
+        "walker/symmetric-interleaved",
+        replace(ANT_WALKER, fall_rule="either"),
+        PAPER,
+        WALKER_STEPS,
+        Interleaved(),
+        symmetric=True,
+    ),
+)
+
+
+def _masters(task: Task, kind: str, ppo: PPOConfig, total_steps: int) -> list[Experiment]:
+    """A master on each kind of sub-policies."""
+    place = task.name.removeprefix("Ant").lower()
+    return [
+        Experiment(
+            f"{place}/{kind}/{walker.name.removeprefix('walker/')}", task, ppo, total_steps, sub_policies=walker.name
+        )
+        for walker in WALKERS
+    ]
+
+
+def _flat(task: Task) -> list[Experiment]:
+    """One policy for everything, with and without stability penalties (paper, section 5)."""
+    place = task.name.removeprefix("Ant").lower()
+    return [
+        Experiment(f"{place}/flat/penalised", replace(task, weights=PENALISED_WEIGHTS), PAPER, FLAT_STEPS),
+        Experiment(f"{place}/flat/free", task, PAPER, FLAT_STEPS),
+    ]
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    row.name: row
+    for row in (
+        *WALKERS,
+        *_masters(ANT_BANDIT, "hrl", MASTER_PPO, 500_000),
+        *_masters(replace(ANT_MAZE, potential="geodesic"), "hrl", MASTER_PPO, 2_000_000),
+        *_masters(ANT_BANDIT, "paper", PAPER_MASTER_BANDIT, 500_000),
+        *_masters(ANT_MAZE, "paper", PAPER_MASTER_MAZE, 2_000_000),
+        *_flat(ANT_BANDIT),
+        *_flat(ANT_MAZE),
+    )
+}
+
+
+def find_row(name: str) -> Experiment:
+    """The row of that name.
+
+    Raises:
+        ValueError: there is none; lists those there are.
+    """
+    if name not in EXPERIMENTS:
+        raise ValueError(f"unknown row {name!r}; known rows: {', '.join(EXPERIMENTS)}")
+    return EXPERIMENTS[name]
+
+
+def with_robot(experiment: Experiment, robot: Robot) -> Experiment:
+    """The row with another ant."""
+    return replace(experiment, task=replace(experiment.task, robot=robot))
+
+
+def read_maze(name_or_file: str) -> Arena:
+    """A maze by name, or from a text file of rows.
+
+    Raises:
+        ValueError: neither a known name nor a file, or the file draws no maze.
+    """
+    if name_or_file in MAZES:
+        return MAZES[name_or_file]
+    path = Path(name_or_file)
+    if not path.is_file():
+        raise ValueError(f"no maze {name_or_file!r}: neither a file nor one of {', '.join(MAZES)}")
+    try:
+        return maze(path.read_text(encoding="utf-8").strip("\n"), name=path.stem)
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is no text file") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None

@@ -1,0 +1,324 @@
+"""Train: one row of the table, for one or several seeds, into a run directory."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from footwork import checkpoint
+from footwork.arena import DIRECTIONS
+from footwork.autoreset import AutoReset
+from footwork.collect import Carry, collect, start
+from footwork.env import Env, Environment
+from footwork.learn import ppo
+from footwork.learn.config import PPOConfig
+from footwork.learn.networks import Policy, categorical_policy, gaussian_policy
+from footwork.options import Options, SubPolicies
+from footwork.physics.batch import BatchPhysics
+from footwork.record import Progress, RunDir, config_to_json, versions
+from footwork.regularisers import AppropriateBias, Regulariser, directions_of_rows, regularise
+from footwork.tasks.task import Task
+from footwork.types import Key, Metrics, Params, Transition
+
+COMPILER_OPTIONS = {"xla_cpu_multi_thread_eigen": False}  # a product's result must not depend on the thread count
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A row of the table: everything that defines a run but its seeds.
+
+    Args:
+        name: the row's address, e.g. ``maze/hrl/interleaved``.
+        task: what is to be done.
+        ppo: how it is learned; ``num_envs`` is per run (per direction, per seed).
+        total_steps: control steps per run. Not in the paper.
+        regulariser: of sub-policy rows.
+        symmetric: one policy in four frames instead of four policies.
+        sub_policies: of master rows: the walker row that the master chooses among.
+        option_steps: the paper's k, of master rows. Not stated in the paper.
+        deterministic_sub_policies: they act by their mode under a master. Not in the paper.
+    """
+
+    name: str
+    task: Task
+    ppo: PPOConfig
+    total_steps: int
+    regulariser: Regulariser | None = None
+    symmetric: bool = False
+    sub_policies: str | None = None
+    option_steps: int = 50
+    deterministic_sub_policies: bool = False
+
+    def __post_init__(self) -> None:
+        if self.total_steps < 1:
+            raise ValueError(f"total_steps must be >= 1, got {self.total_steps}")
+        if self.option_steps < 1:
+            raise ValueError(f"option_steps must be >= 1, got {self.option_steps}")
+        if self.regulariser is not None and not self.is_walker:
+            raise ValueError(f"{self.name}: only sub-policies are regularised")
+
+    @property
+    def is_walker(self) -> bool:
+        """Whether the row trains sub-policies: on a task with the four directions as goals."""
+        return not self.task.observe_xy
+
+    @property
+    def is_master(self) -> bool:
+        """Whether the row trains a master."""
+        return self.sub_policies is not None
+
+    @property
+    def runs_per_seed(self) -> int:
+        """Learners side by side for one seed."""
+        return len(DIRECTIONS) if self.is_walker and not self.symmetric else 1
+
+    @property
+    def needs(self) -> str | None:
+        """The row that must be trained first."""
+        if isinstance(self.regulariser, AppropriateBias):
+            return self.regulariser.partners
+        return self.sub_policies
+
+    def policy(self) -> Policy:
+        """The network that this row trains."""
+        if self.is_master:
+            return categorical_policy(self.ppo, self.task.obs_size, len(DIRECTIONS))
+        return gaussian_policy(self.ppo, self.task.obs_size, 8)
+
+
+class Trained(NamedTuple):
+    """Policies as they come out of a run: parameters have leading axes [seed, run of that seed]."""
+
+    experiment: Experiment
+    seeds: tuple[int, ...]
+    params: Params
+    source: str  # where they were found, for messages
+
+    def sub_policies(self, seed_index: int = 0, deterministic: bool = False) -> SubPolicies:
+        """One seed's sub-policies, for a master or a hand-over test."""
+        params = jax.tree.map(lambda leaf: leaf[seed_index], self.params)
+        if self.experiment.symmetric:
+            params = jax.tree.map(lambda leaf: leaf[0], params)
+        return SubPolicies(self.experiment.policy(), params, self.experiment.symmetric, deterministic)
+
+
+class Learning(NamedTuple):
+    """All that changes while a run learns."""
+
+    iteration: int
+    learners: ppo.TrainState  # leading axis: seeds x runs of a seed
+    carry: Carry
+
+
+class TrainingDiverged(RuntimeError):
+    """A loss or a gradient is no longer finite."""
+
+
+class Interrupted(RuntimeError):
+    """The run was asked to stop, and has saved itself."""
+
+
+def build_environment(
+    experiment: Experiment, num_seeds: int, needed: Trained | None, num_threads: int = 0
+) -> AutoReset:
+    """The training environment of a row: task, regulariser or options, automatic reset."""
+    num_envs = experiment.ppo.num_envs * num_seeds * experiment.runs_per_seed
+    task = experiment.task
+    physics = BatchPhysics(task.robot, task.arena, num_envs, num_threads)
+    if experiment.needs is not None and needed is None:
+        raise ValueError(f"{experiment.name} needs the policies of {experiment.needs}")
+    if not experiment.is_walker:
+        env = Env(task, physics)
+        if needed is None:
+            return AutoReset(env)
+        subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
+        return AutoReset(Options(env, subs, experiment.option_steps))
+    directions = directions_of_rows(num_envs // num_seeds, range(len(DIRECTIONS))) * num_seeds
+    walker = Env(task, physics, directions)
+    partners = None if needed is None else needed.sub_policies()
+    return AutoReset(regularise(walker, experiment.regulariser, experiment.symmetric, num_seeds, partners))
+
+
+def steps_per_iteration(experiment: Experiment) -> int:
+    """Control steps that one run takes between updates."""
+    return experiment.ppo.batch_size * (experiment.option_steps if experiment.is_master else 1)
+
+
+def begin_learning(experiment: Experiment, env: Environment, seeds: tuple[int, ...]) -> Learning:
+    """Fresh learners and first episodes. One root key per seed; the environment's comes from the first."""
+    policy, config = experiment.policy(), experiment.ppo
+    keys = [jax.random.split(jax.random.fold_in(jax.random.key(seed), 0), experiment.runs_per_seed) for seed in seeds]
+    learners = jax.vmap(lambda key: ppo.init(policy, config, key))(jnp.concatenate(keys))
+    return Learning(0, learners, start(env, jax.random.fold_in(jax.random.key(seeds[0]), 1)))
+
+
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
+def update_all(
+    policy: Policy, config: PPOConfig, learners: ppo.TrainState, transition: Transition, key: Key
+) -> tuple[ppo.TrainState, Metrics]:
+    """One PPO update of every run."""
+    keys = jax.random.split(key, transition.reward.shape[0])
+    return jax.vmap(partial(ppo.update, policy, config))(learners, transition, keys)
+
+
+def iterate(experiment: Experiment, env: Environment, learning: Learning, seed: int) -> tuple[Learning, Metrics]:
+    """One rollout and one update; metrics have the leading axis of ``learning.learners``."""
+    policy, config = experiment.policy(), experiment.ppo
+    root = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), learning.iteration)
+    collect_key, update_key = jax.random.split(root)
+    carry, transition, metrics = collect(
+        env, policy, learning.learners.params, learning.carry, collect_key, config.num_steps
+    )
+    learners, update_metrics = update_all(policy, config, learning.learners, transition, update_key)
+    return Learning(learning.iteration + 1, learners, carry), {**metrics, **update_metrics}
+
+
+def train(
+    experiment: Experiment,
+    seeds: tuple[int, ...],
+    run: RunDir,
+    needed: Trained | None = None,
+    num_threads: int = 0,
+    checkpoint_seconds: float = 60.0,
+    tensorboard: bool = False,
+) -> Trained:
+    """Train a row to its end in ``run``, going on from its newest sound checkpoint if it has one.
+
+    Args:
+        experiment: the row.
+        seeds: trained side by side in one batch.
+        run: an existing run directory, locked by the caller.
+        needed: the policies of ``experiment.needs``.
+        num_threads: of the physics; changes no number.
+        checkpoint_seconds: time between checkpoints; changes no number.
+        tensorboard: also write event files (extra ``[tb]``).
+
+    Raises:
+        TrainingDiverged: a metric of the learner is not finite; names it, the step and the last checkpoint.
+        Interrupted: SIGINT or SIGTERM came; the state is saved.
+    """
+    env = build_environment(experiment, len(seeds), needed, num_threads)
+    learning = _resume(run, env, begin_learning(experiment, env, seeds))
+    per_iteration = steps_per_iteration(experiment)
+    num_iterations = math.ceil(experiment.total_steps / per_iteration)
+    total = num_iterations * per_iteration
+    last_save = time.monotonic()
+    with (
+        run.open_metrics(tensorboard) as log,
+        Progress(total, experiment.name, initial_step=learning.iteration * per_iteration) as progress,
+        _stop_signals() as stop_asked,
+    ):
+        while learning.iteration < num_iterations:
+            begun = time.monotonic()
+            learning, metrics = iterate(experiment, env, learning, seeds[0])
+            step = learning.iteration * per_iteration
+            metrics = jax.tree.map(np.asarray, metrics)
+            _check_finite(metrics, step, run)
+            rate = len(seeds) * experiment.runs_per_seed * per_iteration / (time.monotonic() - begun)
+            log.write(step, {**metrics, "time/steps_per_second": rate})
+            progress.update(step, _headline(experiment, metrics))
+            if stop_asked() or time.monotonic() - last_save > checkpoint_seconds:
+                _save(run, env, learning, step)
+                last_save = time.monotonic()
+            if stop_asked():
+                raise Interrupted(f"stopped at step {step} of {total}; saved in {run.path}, go on with --resume")
+    _save(run, env, learning, total)
+    return _finish(experiment, seeds, run, learning, total)
+
+
+def _finish(experiment: Experiment, seeds: tuple[int, ...], run: RunDir, learning: Learning, step: int) -> Trained:
+    shape = (len(seeds), experiment.runs_per_seed)
+    params = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), learning.learners.params)
+    run.save_policy(params, policy_meta(experiment, seeds, step))
+    run.finish({"row": experiment.name, "seeds": list(seeds), "steps": step})
+    return Trained(experiment, seeds, params, str(run.path))
+
+
+def policy_meta(experiment: Experiment, seeds: tuple[int, ...], step: int) -> dict[str, Any]:
+    """What a file of policies says of itself."""
+    return {
+        "experiment": config_to_json(experiment),
+        "seeds": list(seeds),
+        "steps": step,
+        "versions": versions(),
+    }
+
+
+def _tree(env: Environment, learning: Learning) -> dict[str, Any]:
+    return {"learners": learning.learners, "carry": learning.carry, "engine": env.physics.snapshot()}
+
+
+def _save(run: RunDir, env: Environment, learning: Learning, step: int) -> None:
+    run.save_checkpoint(step, _tree(env, learning), {"iteration": learning.iteration})
+
+
+def _resume(run: RunDir, env: Environment, fresh: Learning) -> Learning:
+    """The newest sound checkpoint of the run, or the fresh start."""
+    latest = run.latest_checkpoint()
+    if latest.path is None:
+        if latest.skipped:
+            raise checkpoint.CheckpointError(f"no checkpoint of {run.path} can be read: {latest.skipped[0]}")
+        run.rewind(latest.step)
+        return fresh
+    tree, meta = checkpoint.load(latest.path, _tree(env, fresh))
+    run.rewind(latest.step)
+    env.physics.restore(tree["engine"])
+    return Learning(int(meta["iteration"]), tree["learners"], tree["carry"])
+
+
+def _check_finite(metrics: Metrics, step: int, run: RunDir) -> None:
+    for name in ("policy_loss", "value_loss", "grad_norm", "approx_kl", "entropy"):
+        if not np.isfinite(metrics[name]).all():
+            last = run.latest_checkpoint().path
+            kept = f"the last good checkpoint is {last}" if last else "there is no earlier checkpoint"
+            raise TrainingDiverged(f"{name} is not finite at step {step}; {kept}")
+
+
+def _headline(experiment: Experiment, metrics: Metrics) -> dict[str, float]:
+    """The figures that matter while one watches."""
+    if experiment.is_walker:
+        return {"m/s": float(np.mean(metrics["rollout/progress"]))}
+    ended = max(float(np.sum(metrics["episode/count"])), 1.0)
+    return {
+        "success": float(np.sum(metrics["count/reached"])) / ended,
+        "episode progress m": float(np.nanmean(metrics["episode/progress"])) * experiment.task.robot.control_dt
+        if np.isfinite(metrics["episode/progress"]).any()
+        else math.nan,
+    }
+
+
+@contextmanager
+def _stop_signals() -> Iterator[Any]:
+    """Turn the first SIGINT or SIGTERM into a request; a second one acts at once."""
+    asked = False
+
+    def ask(number: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    try:
+        old = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not in the main thread: signals are somebody else's
+        old = {}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+def shortened(experiment: Experiment, total_steps: int | None) -> Experiment:
+    """The row with another number of steps, for trials."""
+    return experiment if total_steps is None else replace(experiment, total_steps=total_steps)

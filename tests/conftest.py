@@ -1,4 +1,4 @@
-"""Set before anything imports JAX: one CPU device, one thread per operation; then the array checks of the pure modules."""
+"""Set before anything imports JAX: one CPU device, one thread per operation; then the pure modules' array checks."""
 
 import os
 from importlib.util import find_spec
@@ -12,7 +12,7 @@ import hypothesis
 from jaxtyping import install_import_hook
 
 # Every call of these modules' functions is checked against its signature, shapes included.
-# They are called while JAX traces, so the checks cost next to nothing.
+# Under jit that happens while JAX traces, once per compilation.
 CHECKED = ("footwork.rotations", "footwork.tasks", "footwork.learn.gae", "footwork.learn.ppo")
 if find_spec("beartype") and os.environ.get("FOOTWORK_CHECK_SHAPES", "1") != "0":
     install_import_hook(CHECKED, "beartype.beartype")

@@ -28,8 +28,13 @@ from footwork.types import Array, Bool, Float, Int, Key, Physics, PhysicsState, 
 class Environment(Protocol):
     """What Env, its wrappers and Options have in common. ``state`` is a pytree of the environment's own."""
 
-    num_envs: int
-    physics: Physics
+    @property
+    def num_envs(self) -> int:
+        """N."""
+
+    @property
+    def physics(self) -> Physics:
+        """The engine at the bottom."""
 
     def initial(self, key: Key) -> tuple[Any, Array]:
         """A first episode in every row: (state, obs [N, D])."""
@@ -67,11 +72,14 @@ class Env:
         task: what is observed, rewarded and ended.
         physics: the engine, with the task's arena in it.
         goal_index: [N], the goal of each row among the task's; None: drawn anew in every episode.
+        staggered: rows begin their first episodes at random times, so that a rollout holds all
+            phases of an episode and not the same one of every row. For training.
     """
 
     task: Task
     physics: Physics
     goal_index: tuple[int, ...] | None = None
+    staggered: bool = False
 
     def __post_init__(self) -> None:
         if self.goal_index is not None and len(self.goal_index) != self.num_envs:
@@ -95,7 +103,11 @@ class Env:
             held=off,
             stale=off,
         )
-        return self.restart(state, ~off, key)
+        state, obs = self.restart(state, ~off, key)
+        if self.staggered:
+            t = jax.random.randint(jax.random.fold_in(key, 1), (self.num_envs,), 0, self.task.episode_steps)
+            state = state._replace(t=t)
+        return state, obs
 
     def begin(self, state: EnvState, action: Array, key: Key) -> EnvState:
         """Hand the action to the engine, as the policy gave it."""
@@ -109,7 +121,7 @@ class Env:
         else:
             held = np.asarray(state.held)
             moved = self.physics.step(physics, state.action, ~held if held.any() else None)
-        return state._replace(physics=moved, previous=physics, stale=np.zeros_like(state.stale))
+        return state._replace(physics=moved, previous=physics, stale=jnp.zeros_like(state.stale))
 
     def finish(self, state: EnvState, key: Key) -> tuple[EnvState, TimeStep]:
         """Reward and end of the step; a held row earns nothing and ends nothing."""

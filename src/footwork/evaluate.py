@@ -267,22 +267,22 @@ def handover_matrix(
 
     ``ants`` per pair. A fall or flip counts from the hand-over on; the speed is along j over all 300 steps.
     """
-    first, second = np.meshgrid(np.arange(_NUM_DIRECTIONS), np.arange(_NUM_DIRECTIONS), indexing="ij")
-    first, second = (np.repeat(grid.reshape(-1), ants).astype(np.int32) for grid in (first, second))
+    pairs = np.repeat(np.arange(_NUM_DIRECTIONS**2, dtype=np.int32), ants)
+    first, second = pairs // _NUM_DIRECTIONS, pairs % _NUM_DIRECTIONS
     low, high = (steps // _SEGMENT for steps in HANDOVER_AFTER)
     switch = np.random.default_rng(seed).integers(low, high + 1, first.size)
     walk = _walk(sub_policies, task, first.size, seed, num_threads)
     state, after = walk.start(), HANDOVER_STEPS // _SEGMENT
-    fell, flipped = np.zeros(first.size, bool), np.zeros(first.size, bool)
+    fell, flipped = np.zeros_like(first, bool), np.zeros_like(first, bool)
     at_switch, at_end = np.zeros((first.size, 2)), np.zeros((first.size, 2))
     for segment in range(high + after):
         position = _positions(state)
-        at_switch = np.where((segment == switch)[:, None], position, at_switch)
+        at_switch = np.where(np.equal(segment, switch)[:, None], position, at_switch)
         state, events = walk.run(state, np.where(segment < switch, first, second), segment)
         counted = (segment >= switch) & (segment < switch + after)
-        fell |= np.asarray(events["fallen"]) & counted
-        flipped |= np.asarray(events["flipped"]) & counted
-        at_end = np.where((segment == switch + after - 1)[:, None], _positions(state), at_end)
+        fell = fell | (np.asarray(events["fallen"]) & counted)
+        flipped = flipped | (np.asarray(events["flipped"]) & counted)
+        at_end = np.where(np.equal(segment, switch + after - 1)[:, None], _positions(state), at_end)
     seconds = HANDOVER_STEPS * task.robot.control_dt
     speed = np.sum((at_end - at_switch) * _UNIT[second], axis=1) / seconds
     by_pair = [array.reshape(_NUM_DIRECTIONS, _NUM_DIRECTIONS, ants).mean(axis=2) for array in (fell, flipped, speed)]
@@ -306,7 +306,7 @@ def random_switching(
 ) -> dict[str, float]:
     """2000 control steps in which every ant draws a new direction every ``option_steps``.
 
-    The draw is uniform over the other three directions, or over the two orthogonal ones.
+    The draw is uniform over all four directions, or over the two orthogonal to the last.
     Speed is along the direction of each option, over all options after the first; an option under
     0.2 m/s is idle. ``upside_down`` and ``fallen`` (by height) are shares at the end.
     """
@@ -315,14 +315,14 @@ def random_switching(
     generator = np.random.default_rng(seed)
     walk = _walk(sub_policies, task, ants, seed, num_threads)
     state, choice = walk.start(), generator.integers(0, _NUM_DIRECTIONS, ants)
-    per_option, speeds, events = option_steps // _SEGMENT, [], {}
+    per_option, speeds = option_steps // _SEGMENT, []
     for option in range(SWITCHING_STEPS // option_steps):
         if option:
-            turn = generator.choice((1, 3), ants) if orthogonal else generator.integers(1, _NUM_DIRECTIONS, ants)
+            turn = generator.choice((1, 3), ants) if orthogonal else generator.integers(0, _NUM_DIRECTIONS, ants)
             choice = (choice + turn) % _NUM_DIRECTIONS
         before = _positions(state)
         for segment in range(per_option):
-            state, events = walk.run(state, choice.astype(np.int32), option * per_option + segment)
+            state, _ = walk.run(state, choice.astype(np.int32), option * per_option + segment)
         moved = np.sum((_positions(state) - before) * _UNIT[choice], axis=1)
         speeds.append(moved / (option_steps * task.robot.control_dt))
     after_first = np.stack(speeds[1:])
@@ -356,7 +356,8 @@ def transitions(
     task = trained.experiment.task
     if not trained.experiment.is_walker:
         raise ValueError(f"transitions are measured on sub-policies (walker/...), not on {trained.experiment.name}")
-    matrices, switching = [], {str(k): [] for k in periods}
+    matrices: list[list[list[dict[str, float]]]] = []
+    switching: dict[str, list[dict[str, float]]] = {str(k): [] for k in periods}
     for index in range(len(trained.seeds)):
         subs = trained.sub_policies(index, deterministic)
         report(f"seed {trained.seeds[index]}: hand-over matrix")

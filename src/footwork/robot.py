@@ -73,17 +73,17 @@ class Robot:
         return tuple(angle for sign in ANKLE_SIGN for angle in (0.0, sign * ankle))
 
 
-# Calibrated against PyBullet's ant (docs/ant.md). Bullet takes the ankles' axis (1, 1, 0) at its length sqrt 2,
-# so an ankle turns with 1 / sqrt 2 of the torque and against more inertia; its joint limits stop a joint and do not push it back.
+# PyBullet's masses, torques and limits; how far it agrees with PyBullet's ant is measured in docs/ant.md.
+# Bullet's joint limits stop a joint and do not push it back: no stiffness to speak of, and damping 1 / substep.
 HEAVY = Robot(
     name="heavy",
     density=1000.0,
     hip_torque=250.0,
-    ankle_torque=176.8,
+    ankle_torque=250.0,
     hip_range_deg=(-40.0, 40.0),
     ankle_range_deg=(30.0, 100.0),
-    hip_armature=0.001,
-    ankle_armature=0.66,
+    hip_armature=0.01,
+    ankle_armature=0.01,
     joint_damping=0.0,
     limit_solref=(-10.0, -121.0),
     limit_solimp=(0.99, 0.995, 0.001, 0.5, 2.0),
@@ -106,6 +106,9 @@ ROBOTS: dict[str, Robot] = {
     robot.name: robot
     for robot in (
         HEAVY,
+        # Two quirks of Bullet copied: links have the inertia of their bounding boxes, and an ankle's axis (1, 1, 0)
+        # counts at its length sqrt 2, so that it turns with 1 / sqrt 2 of the torque and against twice the inertia.
+        replace(HEAVY, name="bullet", ankle_torque=176.8, hip_armature=0.6, ankle_armature=0.66),
         # MuJoCo's default joint limits push back hard: an easier animal, on stilts.
         replace(HEAVY, name="stiff", limit_solref=_MUJOCO_SOLREF, limit_solimp=_MUJOCO_SOLIMP),
         # Gymnasium's Ant: 200 times lighter, short-ranged, damped joints.

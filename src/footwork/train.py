@@ -138,13 +138,13 @@ def build_environment(
     if experiment.needs is not None and needed is None:
         raise ValueError(f"{experiment.name} needs the policies of {experiment.needs}")
     if not experiment.is_walker:
-        env = Env(task, physics)
+        env = Env(task, physics, staggered=True)
         if needed is None:
             return AutoReset(env)
         subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
         return AutoReset(Options(env, subs, experiment.option_steps))
     directions = directions_of_rows(num_envs // num_seeds, range(len(DIRECTIONS))) * num_seeds
-    walker = Env(task, physics, directions)
+    walker = Env(task, physics, directions, staggered=True)
     partners = None if needed is None else needed.sub_policies()
     return AutoReset(regularise(walker, experiment.regulariser, experiment.symmetric, num_seeds, partners))
 

@@ -61,15 +61,13 @@ class Physics(Protocol):
     def reset(
         self,
         state: PhysicsState,
-        mask: Bool[Array, " N"],
-        qpos: Float[Array, "N 15"],
-        qvel: Float[Array, "N 14"],
+        mask: Any,  # Bool[Array, "N"], of JAX or numpy
+        qpos: Any,  # Float[Array, "N 15"]
+        qvel: Any,  # Float[Array, "N 14"]
     ) -> PhysicsState:
         """Put the rows in ``mask`` at ``qpos``, ``qvel``; the others stay as they are."""
 
-    def step(
-        self, state: PhysicsState, action: Float[Array, "N 8"], active: Bool[Array, " N"] | None = None
-    ) -> PhysicsState:
+    def step(self, state: PhysicsState, action: Any, active: Any | None = None) -> PhysicsState:
         """Advance one control step; rows outside ``active`` are held and cost nothing."""
 
     def snapshot(self) -> dict[str, Any]:

@@ -33,7 +33,9 @@ class PPOConfig:
     hidden_sizes: tuple[int, ...] = (64, 64)  # the paper's Section 4, for the actor and for the critic
 
     # Not in the paper.
-    ent_coef: float = 0.0  # times the entropy, added to the objective
+    ent_coef: float = (
+        0.02  # times the entropy, added to the objective; at 0 half of the walkers never leave their stand
+    )
     max_grad_norm: float | None = None  # the gradient is scaled down to this norm; None leaves it alone
     normalize_advantage: bool = True  # to mean 0 and deviation 1 over all valid samples of the update
     adam_eps: float = 1e-5

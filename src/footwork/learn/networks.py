@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from footwork.types import Array, Float, Int, Key, Params
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
+@runtime_checkable
 class Head(Protocol):
     """A family of action distributions, parametrised by the actor's linear outputs.
 

@@ -50,6 +50,7 @@ class BatchPhysics:
     def __init__(self, robot: Robot, arena: Arena, num_envs: int, num_threads: int = 0):
         if num_envs < 1:
             raise ValueError(f"num_envs must be >= 1, got {num_envs}")
+        _keep_quiet()
         self.control_dt = robot.control_dt
         self.num_envs = num_envs
         self._substeps = robot.substeps
@@ -82,7 +83,7 @@ class BatchPhysics:
         self._qvel[ids] = np.asarray(qvel)[rows]
         self._warmstart[ids] = 0.0
         self._ctrl[ids] = 0.0
-        self._forward(ids)
+        self._forward(np.sort(ids))  # rows may be permuted, and Batch wants rising ids
         return self._read(simulation)
 
     def step(self, state: PhysicsState, action: Any, active: Any | None = None) -> PhysicsState:
@@ -91,8 +92,8 @@ class BatchPhysics:
         action = np.asarray(action)
         bad = ~np.isfinite(action).all(axis=1)
         self._ctrl[simulation] = np.where(bad[:, None], 0.0, np.clip(action, -1.0, 1.0))
-        self._failed[simulation[bad]] = True
-        ids = None if active is None else simulation[np.flatnonzero(active)]
+        self._failed[simulation[bad if active is None else bad & active]] = True
+        ids = None if active is None else np.sort(simulation[np.flatnonzero(active)])
         if ids is None or ids.size:
             try:
                 self._batch.step(ids, nstep=self._substeps)
@@ -119,11 +120,11 @@ class BatchPhysics:
         self._failed[...] = arrays["failed"]
 
     def _forward(self, ids: np.ndarray) -> None:
-        """Bring contacts up to date after a change of state, and forget earlier failures."""
-        self._batch.forward(ids)
-        self._touching[ids] = self._sensors[ids] > 0
+        """Forget earlier failures and bring contacts up to date after a change of state; a bad state is seen here."""
         self._failed[ids] = False
         self._batch.warning[ids] = 0
+        self._batch.forward(ids)
+        self._touching[ids] = self._sensors[ids] > 0
 
     def _read(self, simulation: np.ndarray) -> PhysicsState:
         qpos = self._qpos.astype(np.float32)[simulation]
@@ -139,3 +140,10 @@ class BatchPhysics:
             diverged=~finite | (self._failed | warned)[simulation],
             engine=simulation,
         )
+
+
+def _keep_quiet() -> None:
+    """Divergence is reported per row: MuJoCo need not print it, nor write MUJOCO_LOG.TXT into the working directory."""
+    config = mujoco.MjLogConfig.get()
+    config.logto_console = config.logto_file = False
+    mujoco.MjLogConfig.set(config)

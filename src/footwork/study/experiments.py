@@ -24,6 +24,7 @@ ANT_BANDIT = Task(
 ANT_MAZE = Task("AntMaze", HEAVY, MAZES["u"], FREE_WEIGHTS, observe_xy=True, fall_rule="none", goal_radius=0.5)
 
 WALKER_STEPS = 2_000_000  # control steps per direction; not in the paper
+SYMMETRIC_STEPS = 4 * WALKER_STEPS  # one policy with the experience of four
 FLAT_STEPS = 10_000_000  # as many as four sub-policies and a master together
 
 # The master learns from few decisions: more rows and larger batches than Table 2's S = 128 and 40.
@@ -38,12 +39,12 @@ WALKERS: tuple[Experiment, ...] = (
     Experiment("walker/random-repeated", ANT_WALKER, PAPER, WALKER_STEPS, RandomRepeated()),
     Experiment("walker/appropriate-bias", ANT_WALKER, PAPER, WALKER_STEPS, AppropriateBias()),
     Experiment("walker/interleaved", replace(ANT_WALKER, fall_rule="either"), PAPER, WALKER_STEPS, Interleaved()),
-    Experiment("walker/symmetric", ANT_WALKER, PAPER, WALKER_STEPS, symmetric=True),
+    Experiment("walker/symmetric", ANT_WALKER, PAPER, SYMMETRIC_STEPS, symmetric=True),
     Experiment(
         "walker/symmetric-interleaved",
         replace(ANT_WALKER, fall_rule="either"),
         PAPER,
-        WALKER_STEPS,
+        SYMMETRIC_STEPS,
         Interleaved(),
         symmetric=True,
     ),

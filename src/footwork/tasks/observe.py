@@ -92,12 +92,12 @@ def turn_observation(obs: Float[Array, "N D"], quarter_turns: Int[Array, " N"]) 
     walking along +y at heading zero looks, with one quarter turn, like one walking
     along +x at heading zero. Numbers beyond the first 32 pass unchanged.
     """
-    angle = quarter_turns * (jnp.pi / 2)
+    angle = quarter_turns.astype(jnp.float32) * (jnp.pi / 2)
     joints = _turn_joints(obs[:, :16].reshape(-1, 8, 2), quarter_turns).reshape(-1, 16)
     feet = turn_legs(obs[:, _FEET:_HEIGHT, None], quarter_turns)[:, :, 0]
+    zero, one = jnp.zeros_like(angle), jnp.ones_like(angle)
     about_z = rpy_to_matrix(
-        jnp.stack([0 * angle, 0 * angle, jnp.sin(angle)], -1),
-        jnp.stack([1 + 0 * angle, 1 + 0 * angle, jnp.cos(angle)], -1),
+        jnp.stack([zero, zero, jnp.sin(angle)], axis=-1), jnp.stack([one, one, jnp.cos(angle)], axis=-1)
     )
     torso = rpy_to_matrix(obs[:, _SINE], obs[:, _COSINE])
     rpy = matrix_to_rpy(jnp.swapaxes(about_z, 1, 2) @ torso @ about_z)

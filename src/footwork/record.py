@@ -359,7 +359,9 @@ def config_to_json(config: Any) -> dict[str, Any]:
 
 
 def config_from_json(cls: type[_Config], data: Any) -> _Config:
-    """The inverse of :func:`config_to_json`: every field must be there, and nothing else.
+    """The inverse of :func:`config_to_json`: every field without a default must be there, and nothing unknown.
+
+    A field that was added later, with a default that changes nothing, so reads from older files.
 
     "type" may be left out where the field allows one class only.
 
@@ -580,13 +582,15 @@ def _decode_dataclass(cls: type, value: Any, where: str) -> Any:
     if tag != cls.__name__:
         raise ValueError(f"{where}: expected {cls.__name__}, got {tag}")
     fields = [field.name for field in dataclasses.fields(cls) if field.init]
+    optional = {field.name for field in dataclasses.fields(cls) if field.default is not dataclasses.MISSING}
     unknown = sorted(set(value) - set(fields) - {"type"})
-    missing = [name for name in fields if name not in value]
+    missing = [name for name in fields if name not in value and name not in optional]
     if unknown or missing:
         parts = [f"{word} {', '.join(names)}" for word, names in (("unknown", unknown), ("missing", missing)) if names]
         raise ValueError(f"{where}: {'; '.join(parts)}; the fields of {cls.__name__} are {', '.join(fields)}")
     hints = typing.get_type_hints(cls)
-    return cls(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in fields})
+    given = [name for name in fields if name in value]
+    return cls(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in given})
 
 
 def _decode_union(members: tuple[Any, ...], value: Any, where: str) -> Any:

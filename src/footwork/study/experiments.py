@@ -19,9 +19,26 @@ from footwork.train import Experiment
 
 ANT_WALKER = Task("AntWalker", HEAVY, open_field(), WALKER_WEIGHTS)
 ANT_BANDIT = Task(
-    "AntBandit", HEAVY, bandit(), FREE_WEIGHTS, observe_xy=True, observe_goal=True, fall_rule="none", goal_radius=0.5
+    "AntBandit",
+    HEAVY,
+    bandit(),
+    FREE_WEIGHTS,
+    observe_xy=True,
+    observe_goal=True,
+    episode_steps=2000,
+    fall_rule="none",
+    goal_radius=0.5,
 )
-ANT_MAZE = Task("AntMaze", HEAVY, MAZES["u"], FREE_WEIGHTS, observe_xy=True, fall_rule="none", goal_radius=0.5)
+ANT_MAZE = Task(
+    "AntMaze",
+    HEAVY,
+    MAZES["u"],
+    FREE_WEIGHTS,
+    observe_xy=True,
+    episode_steps=2000,
+    fall_rule="none",
+    goal_radius=0.5,
+)
 
 WALKER_STEPS = 2_000_000  # control steps per direction; not in the paper
 SYMMETRIC_STEPS = 4 * WALKER_STEPS  # one policy with the experience of four

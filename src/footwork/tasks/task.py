@@ -129,7 +129,7 @@ class Task:
         flipped = quaternion_to_matrix(now.qpos[:, 3:7])[:, 2, 2] < 0.0
         distance = jnp.linalg.norm(goal - now.qpos[:, :2], axis=-1)
         reached = distance <= (self.goal_radius or -1.0)
-        values = self._terms(previous, action, now, goal, fallen, flipped)
+        values = self._terms(previous, action, now, goal, fallen, flipped, reached)
         terminated = self._fall_ends(fallen, flipped) | diverged | reached
         obs = self.observe(now, goal)
         return TimeStep(
@@ -158,6 +158,7 @@ class Task:
         goal: Array,
         fallen: Bool[Array, " N"],
         flipped: Bool[Array, " N"],
+        reached: Bool[Array, " N"],
     ) -> dict[str, Float[Array, " N"]]:
         position, speed = scaled_joints(now, self.robot)
         values = {
@@ -168,6 +169,7 @@ class Task:
             "joints_at_limit": terms.joints_at_limit(position),
             "feet_collision": terms.feet_collision(now.foot_collision),
             "flip": flipped.astype(jnp.float32),
+            "goal": reached.astype(jnp.float32),
         }
         return {name: getattr(self.weights, name) * value for name, value in values.items()}
 

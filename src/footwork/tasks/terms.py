@@ -24,7 +24,8 @@ class RewardWeights:
     stall_torque: float = -0.1
     joints_at_limit: float = -0.1
     feet_collision: float = -1.0  # switched off in PyBullet's own code; the paper has it
-    flip: float = 0.0  # not in the paper
+    flip: float = 0.0  # once per step upside down; not in the paper
+    goal: float = 0.0  # once, in the step that ends inside the goal radius; not in the paper
 
 
 WALKER_WEIGHTS = RewardWeights()

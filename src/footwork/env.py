@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from footwork.tasks.task import Task
+from footwork.tasks.task import Task, last_finite
 from footwork.types import Array, Bool, Float, Int, Key, Physics, PhysicsState, TimeStep
 
 
@@ -121,7 +121,7 @@ class Env:
         else:
             held = np.asarray(state.held)
             moved = self.physics.step(physics, state.action, ~held if held.any() else None)
-        return state._replace(physics=moved, previous=physics, stale=jnp.zeros_like(state.stale))
+        return state._replace(physics=moved, previous=state.physics, stale=jnp.zeros_like(state.stale))
 
     def finish(self, state: EnvState, key: Key) -> tuple[EnvState, TimeStep]:
         """Reward and end of the step; a held row earns nothing and ends nothing."""
@@ -136,7 +136,8 @@ class Env:
             valid=step.valid & active,
         )
         done = step.terminated | step.truncated
-        return state._replace(t=t, held=state.held | done), step
+        physics = last_finite(state.previous, state.physics)  # a row that diverged stays where it last was
+        return state._replace(physics=physics, t=t, held=state.held | done), step
 
     def restart(self, state: EnvState, mask: Bool[Array, " N"], key: Key) -> tuple[EnvState, Array]:
         """A new episode in the masked rows, airborne: no foot touches anything yet."""

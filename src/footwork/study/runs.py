@@ -7,7 +7,6 @@ name means the newest finished run of that row under RUNS, else the packaged wei
 
 from __future__ import annotations
 
-import hashlib
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -108,7 +107,7 @@ def load_policies(path: Path) -> Trained:
         CheckpointError: the file is missing, damaged or foreign, or its arrays are not of the
             shapes that its own config asks for.
     """
-    _, meta = checkpoint.load_arrays(path)
+    arrays, meta = checkpoint.load_arrays(path)
     try:
         experiment = config_from_json(Experiment, meta["experiment"])
         seeds = tuple(int(seed) for seed in meta["seeds"])
@@ -116,6 +115,8 @@ def load_policies(path: Path) -> Trained:
         raise CheckpointError(f"{path}: no policies of a known kind: {error}") from None
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (len(seeds), experiment.runs_per_seed)))
     like = jax.eval_shape(jax.vmap(jax.vmap(experiment.policy().init)), keys)
+    if not any(name.startswith("critic/") for name in arrays):  # packaged to act, not to learn on
+        like = {"actor": like["actor"]}
     params, _ = checkpoint.load(path, like)
     return Trained(experiment, seeds, params, str(path))
 
@@ -164,7 +165,3 @@ def find_needed(trained: Trained, runs: Path) -> Trained | None:
         return load_policies(kept)
     return find_trained(needs, runs)
 
-
-def fingerprint(path: Path) -> str:
-    """Short hash of a file, to say which weights were meant."""
-    return hashlib.blake2b(path.read_bytes(), digest_size=8).hexdigest()

@@ -124,7 +124,7 @@ class Task:
         learned from; it terminates and is counted in ``events``.
         """
         diverged = now.diverged
-        now = _where_row(diverged, previous, now)
+        now = last_finite(previous, now)
         fallen = now.qpos[:, 2] <= self.robot.fall_height
         flipped = quaternion_to_matrix(now.qpos[:, 3:7])[:, 2, 2] < 0.0
         distance = jnp.linalg.norm(goal - now.qpos[:, :2], axis=-1)
@@ -182,8 +182,9 @@ class Task:
         return ends
 
 
-def _where_row(mask: Bool[Array, " N"], chosen: PhysicsState, other: PhysicsState) -> PhysicsState:
-    """Per row, one state's arrays or another's; the engine's own stays the other's."""
-    pick = lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (b.ndim - 1)), a, b)  # noqa: E731
+def last_finite(previous: PhysicsState, now: PhysicsState) -> PhysicsState:
+    """The state, with the arrays of the one before in rows that diverged; the engine's own stays."""
+    rows = now.diverged
+    pick = lambda a, b: jnp.where(rows.reshape(rows.shape + (1,) * (b.ndim - 1)), a, b)  # noqa: E731
     fields = ("qpos", "qvel", "foot_contact", "foot_collision")
-    return other._replace(**{name: pick(getattr(chosen, name), getattr(other, name)) for name in fields})
+    return now._replace(**{name: pick(getattr(previous, name), getattr(now, name)) for name in fields})

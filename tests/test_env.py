@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from footwork import collect as collecting
-from footwork import options as optioning
 from footwork.arena import DIRECTIONS
 from footwork.autoreset import AutoReset
 from footwork.collect import collect, start
@@ -62,6 +60,11 @@ def observe(physics):
     return observe_walker(physics, STANDING.robot)
 
 
+@partial(jit, static_argnums=0)
+def init_all(policy, keys):
+    return jax.vmap(policy.init)(keys)
+
+
 def numpy_of(tree):
     return jax.tree.map(np.array, tree)
 
@@ -91,15 +94,15 @@ def walkers(task=STANDING, num_envs=N, **fields):
 
 def constant_policies(actions):
     """Sub-policies that always do the same, one action of every joint per direction."""
-    zero = jax.tree.map(jnp.zeros_like, POLICY.init(jax.random.key(0)))
-    params = jax.tree.map(lambda leaf: jnp.stack([leaf] * len(actions)), zero)
+    shapes = jax.eval_shape(POLICY.init, jax.random.key(0))
+    params = jax.tree.map(lambda leaf: jnp.zeros((len(actions), *leaf.shape)), shapes)
     params["actor"]["output"]["bias"] = params["actor"]["output"]["bias"].at[:, :8].set(jnp.array(actions)[:, None])
     return SubPolicies(POLICY, params, deterministic=True)
 
 
 def lively_policies(symmetric=False):
     """Sub-policies that react to what they see, each in its own way."""
-    params = jax.vmap(POLICY.init)(jax.random.split(jax.random.key(3), 4))
+    params = init_all(POLICY, jax.random.split(jax.random.key(3), 4))
     params["actor"]["output"]["weight"] *= 60.0
     if symmetric:
         params = jax.tree.map(lambda leaf: leaf[0], params)
@@ -228,23 +231,24 @@ def test_a_row_that_diverges_within_an_option_poisons_nothing(four_step_option, 
 def test_sub_policies_act_for_their_direction_on_32_numbers(lively):
     obs = jax.random.normal(jax.random.key(0), (N, 36))
     direction = jnp.arange(N) % 4
-    action = lively.act(obs, direction, jax.random.key(0))
+    act, mode = jit(lively.act), jit(POLICY.mode)
+    action = act(obs, direction, jax.random.key(0))
     for row in range(N):
         params = jax.tree.map(lambda leaf, row=row: leaf[row % 4], lively.params)
-        np.testing.assert_allclose(action[row], POLICY.mode(params, obs[row, :32]), rtol=1e-4, atol=1e-4)
-    np.testing.assert_array_equal(lively.act(obs.at[:, 32:].add(9.0), direction, jax.random.key(0)), action)
+        np.testing.assert_allclose(action[row], mode(params, obs[row, :32]), rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(act(obs.at[:, 32:].add(9.0), direction, jax.random.key(0)), action)
 
 
 def test_one_symmetric_policy_serves_four_directions():
-    subs = lively_policies(symmetric=True)
+    act, turn_back = jit(lively_policies(symmetric=True).act), jit(turn_action)
     obs = walkers().initial(jax.random.key(0))[1]
     obs = obs.at[:, :24].add(0.3 * jax.random.normal(jax.random.key(1), (N, 24)))
     for quarters in (1, 2, 3):
         turns = jnp.full(N, quarters)
         for direction in range(4):
             ahead, there = jnp.full(N, direction), jnp.full(N, (direction - quarters) % 4)
-            turned = subs.act(turn_observation(obs, turns), there, jax.random.key(0))
-            expected = turn_action(subs.act(obs, ahead, jax.random.key(0)), turns)
+            turned = act(turn(obs, turns), there, jax.random.key(0))
+            expected = turn_back(act(obs, ahead, jax.random.key(0)), turns)
             np.testing.assert_allclose(turned, expected, rtol=1e-3, atol=1e-3)
 
 
@@ -285,7 +289,7 @@ def test_a_restart_leaves_the_other_rows_alone():
     mask = np.arange(N) % 3 == 0
     state = jax.tree.map(jnp.asarray, state)
     after, obs = env.restart(state, jnp.asarray(mask), jax.random.key(0))
-    np.testing.assert_array_equal(obs, STANDING.observe(after.physics, after.goal))
+    np.testing.assert_allclose(obs, observe(after.physics), atol=1e-6)
     for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
         np.testing.assert_array_equal(np.asarray(old)[~mask], np.asarray(new)[~mask])
     np.testing.assert_array_equal(after.goal, state.goal)  # goals belong to rows
@@ -444,9 +448,9 @@ def test_with_one_policy_the_ant_changes_direction_instead():
 NUM_STEPS, RUNS = 10, 4
 
 
-def rollouts(env, policy, num_rollouts=3, num_runs=RUNS):
-    params = jax.vmap(policy.init)(jax.random.split(jax.random.key(0), num_runs))
-    carry, transitions, metrics = start(env, jax.random.key(1)), [], []
+def rollouts(env, policy, num_rollouts=3, num_runs=RUNS, carry=None):
+    params = init_all(policy, jax.random.split(jax.random.key(0), num_runs))
+    carry, transitions, metrics = carry or start(env, jax.random.key(1)), [], []
     for i in range(num_rollouts):
         carry, transition, more = collect(env, policy, params, carry, jax.random.key(2 + i), NUM_STEPS)
         transitions.append(numpy_of(transition))
@@ -454,35 +458,26 @@ def rollouts(env, policy, num_rollouts=3, num_runs=RUNS):
     return params, jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *transitions), metrics
 
 
-class Traced:
-    """Counts how often Python runs what is compiled; once per compilation."""
+def count_calls(monkeypatch, owner, name):
+    """Count from now on how often a method's Python runs: of what is compiled, once per trace."""
+    calls, method = [], getattr(owner, name)
 
-    def __init__(self):
-        self.count = Counter()
+    def counted(*arguments):
+        calls.append(name)
+        return method(*arguments)
 
-    def __call__(self, name, function):
-        def counted(*arguments):
-            self.count[name] += 1
-            return function(*arguments)
-
-        return counted
+    monkeypatch.setattr(owner, name, counted)
+    return calls
 
 
-def watch(monkeypatch, *methods):
-    """From now on count the traces of these methods, given as (class, name)."""
-    traced = Traced()
-    for owner, name in methods:
-        monkeypatch.setattr(owner, name, traced(f"{owner.__name__}.{name}", getattr(owner, name)))
-    return traced.count
-
-
-def test_a_rollout_is_what_the_learner_needs():
+def test_a_rollout_is_what_the_learner_needs(monkeypatch):
     env = AutoReset(
         Interleave(walkers(TEN_STEPS, 2 * N, staggered=True), Interleaved(mean_steps=6, every=2), num_groups=1)
     )
-    before = traces(*COLLECTORS)
-    params, rollout, metrics = rollouts(env, POLICY)
-    assert [n - b for n, b in zip(traces(*COLLECTORS), before, strict=True)] == [1, 1, 1]  # traced once in three
+    carry = start(env, jax.random.key(1))
+    begins, finishes = (count_calls(monkeypatch, AutoReset, name) for name in ("begin", "finish"))
+    params, rollout, metrics = rollouts(env, POLICY, carry=carry)
+    assert (len(begins), len(finishes)) == (1, 1)  # traced once in three rollouts
     shape = (RUNS, 3 * NUM_STEPS, 2 * N // RUNS)
     assert rollout.obs.shape == rollout.next_obs.shape == (*shape, 32)
     assert rollout.action.shape == (*shape, 8)
@@ -517,14 +512,15 @@ def test_episode_sums_run_on_over_rollouts():
     assert by_rollout.std() > 0
 
 
-def test_a_master_is_traced_once_too(lively):
+def test_a_master_is_traced_once_too(lively, monkeypatch):
     task = replace(ANT_MAZE, episode_steps=7)
     env = AutoReset(Options(Env(task, BatchPhysics(task.robot, task.arena, N, 1), staggered=True), lively, 2))
     master = categorical_policy(CONFIG, 34, 4)
-    functions = (*COLLECTORS, optioning._option_begin, optioning._option_finish)
-    before = traces(*functions)
-    _, rollout, _ = rollouts(env, master, num_runs=1)
-    assert [n - b for n, b in zip(traces(*functions), before, strict=True)] == [1] * 5
+    carry = start(env, jax.random.key(1))
+    methods = ((AutoReset, "begin"), (AutoReset, "finish"), (SubPolicies, "act"), (Env, "finish"))
+    calls = [count_calls(monkeypatch, owner, name) for owner, name in methods]
+    _, rollout, _ = rollouts(env, master, num_runs=1, carry=carry)
+    assert [len(found) for found in calls] == [1, 1, 1, 1]
     assert set(np.unique(rollout.action)) <= {0, 1, 2, 3}
     stays = ~(rollout.terminated | rollout.truncated)[:, :-1]
     np.testing.assert_array_equal(rollout.obs[:, 1:][stays], rollout.next_obs[:, :-1][stays])

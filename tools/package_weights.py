@@ -64,7 +64,7 @@ def main():
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     runs = parser.parse_args().runs
     for row in EXPERIMENTS:
-        if not row.split("/")[1] == "paper":
+        if row.split("/")[1] != "paper":
             package(row, runs)
     (WEIGHTS / "README.md").write_text(describe(), encoding="utf-8")
     size = sum(path.stat().st_size for path in WEIGHTS.rglob("*.safetensors"))

@@ -15,6 +15,7 @@ lazily, at its next step: ``stale`` marks the rows it must overwrite first.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -92,22 +93,7 @@ class Env:
 
     def initial(self, key: Key) -> tuple[EnvState, Array]:
         """All rows at the start of an episode."""
-        physics = jax.tree.map(jnp.asarray, self.physics.initial())
-        off = jnp.zeros(self.num_envs, bool)
-        state = EnvState(
-            physics=physics,
-            previous=physics,
-            action=jnp.zeros((self.num_envs, 8)),
-            goal=jnp.zeros((self.num_envs, 2)),
-            t=jnp.zeros(self.num_envs, jnp.int32),
-            held=off,
-            stale=off,
-        )
-        state, obs = self.restart(state, ~off, key)
-        if self.staggered:
-            t = jax.random.randint(jax.random.fold_in(key, 1), (self.num_envs,), 0, self.task.episode_steps)
-            state = state._replace(t=t)
-        return state, obs
+        return _first_episodes(self, self.physics.initial(), key)
 
     def begin(self, state: EnvState, action: Array, key: Key) -> EnvState:
         """Hand the action to the engine, as the policy gave it."""
@@ -164,6 +150,25 @@ class Env:
             stale=state.stale | mask,
         )
         return state, self.task.observe(physics, goal)
+
+
+@partial(jax.jit, static_argnums=0)  # step by step, JAX would compile each operation for itself: seconds
+def _first_episodes(env: Env, physics: PhysicsState, key: Key) -> tuple[EnvState, Array]:
+    off = jnp.zeros(env.num_envs, bool)
+    state = EnvState(
+        physics=physics,
+        previous=physics,
+        action=jnp.zeros((env.num_envs, 8)),
+        goal=jnp.zeros((env.num_envs, 2)),
+        t=jnp.zeros(env.num_envs, jnp.int32),
+        held=off,
+        stale=off,
+    )
+    state, obs = env.restart(state, ~off, key)
+    if env.staggered:
+        t = jax.random.randint(jax.random.fold_in(key, 1), (env.num_envs,), 0, env.task.episode_steps)
+        state = state._replace(t=t)
+    return state, obs
 
 
 def split_phases(key: Key) -> tuple[Key, Key, Key]:

@@ -166,8 +166,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """Figures of a row over ``num_episodes`` episodes of each of its seeds, with 95 % intervals.
 
-    Success is judged at several radii from the closest approach: ``inf`` radii are
-    no use to a walker, whose success is None.
+    Success is judged at several radii from the closest approach; a walker's is None, its targets being
+    10 km away. Time to goal is known to one decision of the policy: a master's is rounded up to a whole option.
+    The intervals are over episodes, all seeds pooled: how much seeds differ is not in them.
     """
     experiment = trained.experiment
     episodes = []

@@ -100,7 +100,7 @@ class Options:
     def begin(self, state: OptionsState, action: Array, key: Key) -> OptionsState:
         """Take the master's choice."""
         nothing = jax.tree.map(jnp.zeros_like, state.total)
-        far = {**nothing.events, "goal_distance": jnp.full((self.num_envs,), jnp.inf)}
+        far = {**nothing.events, "goal_distance": jnp.full((self.num_envs,), jnp.inf, jnp.float32)}
         return state._replace(choice=action, total=nothing._replace(events=far))
 
     def simulate(self, state: OptionsState, key: Key) -> OptionsState:

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -66,6 +66,8 @@ class Experiment:
             raise ValueError(f"option_steps must be >= 1, got {self.option_steps}")
         if self.regulariser is not None and not self.is_walker:
             raise ValueError(f"{self.name}: only sub-policies are regularised")
+        if self.is_master and self.is_walker:
+            raise ValueError(f"{self.name}: a master needs a task with coordinates (observe_xy)")
 
     @property
     def is_walker(self) -> bool:
@@ -206,12 +208,16 @@ def train(
     Raises:
         TrainingDiverged: a metric of the learner is not finite; names it, the step and the last checkpoint.
         Interrupted: SIGINT or SIGTERM came; the state is saved.
+        ValueError: the run is beyond ``experiment.total_steps`` already.
     """
     env = build_environment(experiment, len(seeds), needed, num_threads)
     learning = _resume(run, env, begin_learning(experiment, env, seeds))
     per_iteration = steps_per_iteration(experiment)
     num_iterations = math.ceil(experiment.total_steps / per_iteration)
     total = num_iterations * per_iteration
+    if learning.iteration > num_iterations:
+        at = learning.iteration * per_iteration
+        raise ValueError(f"{run.path} is at step {at} already: total_steps must be at least that, got {total}")
     last_save = time.monotonic()
     with (
         run.open_metrics(tensorboard) as log,
@@ -241,7 +247,7 @@ def _finish(experiment: Experiment, seeds: tuple[int, ...], run: RunDir, learnin
     params = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), learning.learners.params)
     run.save_policy(params, policy_meta(experiment, seeds, step))
     run.finish({"row": experiment.name, "seeds": list(seeds), "steps": step})
-    return Trained(experiment, seeds, params, str(run.path))
+    return Trained(experiment, seeds, params, str(run.policy_path))
 
 
 def policy_meta(experiment: Experiment, seeds: tuple[int, ...], step: int) -> dict[str, Any]:
@@ -317,8 +323,3 @@ def _stop_signals() -> Iterator[Any]:
     finally:
         for number, handler in old.items():
             signal.signal(number, handler)
-
-
-def shortened(experiment: Experiment, total_steps: int | None) -> Experiment:
-    """The row with another number of steps, for trials."""
-    return experiment if total_steps is None else replace(experiment, total_steps=total_steps)

@@ -9,7 +9,7 @@ letter axis
 ``N``  environment row (one ant)
 ``R``  run: a learner with its own parameters (a direction, a seed)
 ``J``  joint, in the order hip_1, ankle_1, ..., hip_4, ankle_4
-``F``  foot, in the order of the legs: front left, front right, back left, back right
+``F``  foot, in the order of the legs: counter-clockwise from (+x, +y) at heading zero
 ``D``  observation
 ====== =======================================================================
 

@@ -38,7 +38,7 @@ class Train:
 
     row: RowName  # its address, as `footwork list` shows it
     seeds: tuple[int, ...] = (0,)  # trained side by side in one batch
-    robot: str | None = None  # another ant: heavy, stiff or light
+    robot: str | None = None  # another ant: heavy, bullet, stiff or light
     maze: str | None = None  # another maze: a name, or a text file of rows of # . r g
     runs: Path = Path("runs")  # where runs are kept
     name: str | None = None  # folder of this run below its row's; default: the seeds
@@ -177,7 +177,8 @@ def _customised(command: Train, rest: list[str]) -> Experiment:
         experiment = replace(experiment, task=replace(experiment.task, arena=read_maze(command.maze)))
     if not rest:
         return experiment
-    return tyro.cli(type(experiment), default=experiment, args=rest, prog=f"footwork train {command.row}")
+    prog, config = f"footwork train {command.row}", (tyro.conf.AvoidSubcommands,)  # the row has chosen its regulariser
+    return tyro.cli(type(experiment), default=experiment, args=rest, prog=prog, config=config)
 
 
 def _evaluate(command: Evaluate, rest: list[str]) -> int:

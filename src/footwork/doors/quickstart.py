@@ -31,12 +31,13 @@ def quickstart(to: Path, seed: int, steps: int | None, num_threads: int) -> None
         RunError: ``to`` is in use, or the packaged weights are missing.
     """
     begun = time.monotonic()
-    experiment = replace(find_row(MASTER_ROW), total_steps=steps or STEPS)
+    experiment = replace(find_row(MASTER_ROW), total_steps=STEPS if steps is None else steps)
     print(f"Training a master on {experiment.task.arena.name!r} on top of the packaged {experiment.needs}.")
     print(f"Every {experiment.option_steps} control steps it chooses which way the ant walks. No joint is ever reset.")
     runs = to / "runs"
+    flat = find_trained(FLAT_ROW, runs)  # before the training: what is missing is said at once
+    find_trained(str(experiment.needs), runs)
     master = train_row(experiment, (seed,), runs, resume=True, num_threads=num_threads)
-    flat = find_trained(FLAT_ROW, runs)
     print(f"Evaluating {MASTER_ROW} and the packaged {FLAT_ROW} on {EPISODES} episodes each.")
     reports = [
         evaluate(trained, find_needed(trained, runs), EPISODES, num_threads=num_threads) for trained in (master, flat)

@@ -50,6 +50,8 @@ class BatchPhysics:
     def __init__(self, robot: Robot, arena: Arena, num_envs: int, num_threads: int = 0):
         if num_envs < 1:
             raise ValueError(f"num_envs must be >= 1, got {num_envs}")
+        if num_threads < 0:
+            raise ValueError(f"num_threads must be >= 0, got {num_threads}")
         _keep_quiet()
         self.control_dt = robot.control_dt
         self.num_envs = num_envs

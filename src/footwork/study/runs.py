@@ -17,7 +17,7 @@ import jax
 from footwork import checkpoint
 from footwork.checkpoint import CheckpointError
 from footwork.record import RunDir, RunError, config_from_json, config_to_json
-from footwork.study.experiments import find_row
+from footwork.study.experiments import find_row, with_robot
 from footwork.train import Experiment, Trained, policy_meta, train
 
 NEEDED = "needed.safetensors"
@@ -93,11 +93,25 @@ def _needed_by(experiment: Experiment, run: RunDir, runs: Path, num_threads: int
     try:
         needed = find_trained(experiment.needs, runs)
     except RunError:
-        needed = train_row(find_row(experiment.needs), (0,), runs, resume=True, num_threads=num_threads)
+        row = with_robot(find_row(experiment.needs), experiment.task.robot)
+        needed = train_row(row, (0,), runs, resume=True, num_threads=num_threads)
+    _check_fit(experiment, needed)
     first = jax.tree.map(lambda leaf: leaf[:1], needed.params)
     meta = {**policy_meta(needed.experiment, needed.seeds[:1], needed.experiment.total_steps), "from": needed.source}
     checkpoint.save(kept, first, meta)
     return load_policies(kept)
+
+
+def _check_fit(experiment: Experiment, needed: Trained) -> None:
+    """Refuse policies that do not walk, or that learned to on another ant."""
+    if not needed.experiment.is_walker:
+        raise ValueError(f"{experiment.name} stands on sub-policies (walker/...), not on {needed.experiment.name}")
+    wanted, found = experiment.task.robot, needed.experiment.task.robot
+    if wanted != found:
+        raise ValueError(
+            f"{experiment.name} is for ant {wanted.name!r}, the {needed.experiment.name} found ({needed.source}) is "
+            f"for another ({found.name!r}): footwork train {needed.experiment.name} --robot {wanted.name}"
+        )
 
 
 def load_policies(path: Path) -> Trained:
@@ -148,20 +162,24 @@ def find_trained(row: str, runs: Path) -> Trained:
     find_row(row)
     for run in finished_runs(row, runs):
         return load_run(run)
-    weights = packaged(row)
-    if weights.is_file():
-        with resources.as_file(weights) as path:
-            return load_policies(path)._replace(source=PACKAGED)
+    if packaged(row).is_file():
+        return _load_packaged(row)
     raise RunError(f"no finished run of {row} in {runs} and none in the package: footwork train {row}")
 
 
+def _load_packaged(row: str) -> Trained:
+    with resources.as_file(packaged(row)) as path:
+        return load_policies(path)._replace(source=PACKAGED)
+
+
 def find_needed(trained: Trained, runs: Path) -> Trained | None:
-    """The policies that ``trained`` stands on: kept beside it, else what their row name means."""
+    """The policies that ``trained`` stands on: kept beside it, packaged with it, else what their row name means."""
     needs = trained.experiment.needs
     if needs is None or not trained.experiment.is_master:
         return None
+    if trained.source == PACKAGED and packaged(needs).is_file():
+        return _load_packaged(needs)  # a run of the same name in ``runs`` is not what it was trained on
     kept = Path(trained.source).parent / NEEDED
     if trained.source != PACKAGED and kept.is_file():
         return load_policies(kept)
     return find_trained(needs, runs)
-

@@ -14,8 +14,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("MPLBACKEND", "agg")
 
-import hypothesis
-from jaxtyping import install_import_hook
+import hypothesis  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
 
 # Every call of these modules' functions is checked against its signature, shapes included.
 # Under jit that happens while JAX traces, once per compilation.

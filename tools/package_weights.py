@@ -8,6 +8,7 @@ without their critics, which nothing reads once they are trained.
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -15,7 +16,7 @@ import jax
 from footwork import checkpoint
 from footwork.record import config_to_json
 from footwork.study.experiments import EXPERIMENTS
-from footwork.study.runs import finished_runs, load_run
+from footwork.study.runs import NEEDED, find_trained, finished_runs, load_policies, load_run
 
 WEIGHTS = Path(__file__).parents[1] / "src" / "footwork" / "weights"
 MAX_BYTES = 2_000_000
@@ -26,6 +27,9 @@ def package(row, runs):
     for run in finished_runs(row, runs):
         trained = load_run(run)
         _, meta = checkpoint.load_arrays(run.policy_path)
+        if replace(trained.experiment, total_steps=EXPERIMENTS[row].total_steps) != EXPERIMENTS[row]:
+            raise SystemExit(f"{run.path} was trained with other fields than the table's {row}")
+        check_needed(trained, run, runs)
         params = jax.tree.map(lambda leaf: leaf[:1], trained.params)
         if not trained.experiment.is_master:
             params = {"actor": params["actor"]}
@@ -33,6 +37,16 @@ def package(row, runs):
         meta = {**meta, "seeds": list(trained.seeds[:1]), "batch": list(trained.seeds), "experiment": experiment}
         checkpoint.save(WEIGHTS / f"{row}.safetensors", params, meta)
         return
+
+
+def check_needed(trained, run, runs):
+    """A packaged master must stand on the sub-policies that are packaged."""
+    if trained.experiment.is_master:
+        kept = load_policies(run.path / NEEDED).params["actor"]
+        found = find_trained(trained.experiment.needs, runs).params["actor"]
+        same = jax.tree.map(lambda a, b: bool((a[0] == b[0]).all()), kept, found)
+        if not all(jax.tree.leaves(same)):
+            raise SystemExit(f"{run.path} stands on other policies than the newest {trained.experiment.needs}")
 
 
 def describe():

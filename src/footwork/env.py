@@ -85,6 +85,10 @@ class Env:
     def __post_init__(self) -> None:
         if self.goal_index is not None and len(self.goal_index) != self.num_envs:
             raise ValueError(f"goal_index must have one entry per row, got {len(self.goal_index)} for {self.num_envs}")
+        if self.goal_index is not None and max(self.goal_index) >= len(self.task.goals):
+            raise ValueError(
+                f"{self.task.name} has {len(self.task.goals)} goals, goal_index names {max(self.goal_index)}"
+            )
 
     @property
     def num_envs(self) -> int:

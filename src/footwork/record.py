@@ -136,6 +136,14 @@ class RunDir:
             raise RunError(f"{self.path / 'config.json'} is damaged: it has no config")
         return config
 
+    def versions(self) -> dict[str, Any]:
+        """The versions the run was created with, as :func:`versions` gave them.
+
+        Raises:
+            RunError: config.json cannot be read.
+        """
+        return dict(_read_object(self.path / "config.json").get("versions", {}))
+
     def summary(self) -> dict[str, Any]:
         """What :meth:`finish` was given.
 
@@ -219,8 +227,8 @@ class RunDir:
     def rewind(self, step: int) -> None:
         """Forget what came after ``step``, as the first act of resuming from its checkpoint.
 
-        Later lines of metrics, later checkpoints (damaged, or they would have been resumed from)
-        and half-written files of killed processes go. A step of -1 forgets everything but the config.
+        Later lines of metrics and half-written files of killed processes go; later checkpoints (damaged,
+        or they would have been resumed from) are renamed to ``.damaged``.
 
         Raises:
             RunError: the metrics cannot be read or cut.
@@ -228,9 +236,12 @@ class RunDir:
         truncate_metrics(self.metrics_path, step)
         late = [path for at, path in self.checkpoints() if at > step]
         torn = [path for place in (self.path, self.path / "checkpoints") for path in place.glob(".*.tmp")]
-        for path in late + torn:
+        for path in torn:
             with contextlib.suppress(OSError):
                 path.unlink()
+        for path in late:  # damaged, since a sound one would have been the newest: put aside, in case it is wanted
+            with contextlib.suppress(OSError):
+                path.replace(path.with_suffix(".damaged"))
 
     def open_metrics(self, tensorboard: bool = False) -> MetricsWriter:
         """The run's metrics, to be appended to.

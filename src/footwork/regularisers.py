@@ -91,7 +91,7 @@ class Interleaved:
 Regulariser = RandomStart | RandomRepeated | AppropriateBias | Interleaved
 
 
-def noise_turn(regulariser: RandomStart | RandomRepeated | AppropriateBias, t: Int[Array, " N"]) -> Bool[Array, " N"]:
+def others_turn(regulariser: RandomStart | RandomRepeated | AppropriateBias, t: Int[Array, " N"]) -> Bool[Array, " N"]:
     """Whether somebody else acts at step ``t`` (from 0) of an episode."""
     if isinstance(regulariser, RandomRepeated):
         return (t % regulariser.every) >= regulariser.every - regulariser.duration
@@ -137,14 +137,13 @@ class Intervention:
 
     def initial(self, key: Key) -> tuple[InterventionState, Array]:
         """A first episode in every row."""
-        inner, obs = self.inner.initial(key)
-        rows = jnp.zeros(self.num_envs, jnp.int32)
-        state = InterventionState(inner, obs, rows, rows.astype(bool))
-        return self.restart(state, jnp.ones(self.num_envs, bool), key)
+        inner_key, partner_key = jax.random.split(key)
+        inner, obs = self.inner.initial(inner_key)
+        return InterventionState(inner, obs, self._draw_partners(partner_key), jnp.zeros(self.num_envs, bool)), obs
 
     def begin(self, state: InterventionState, action: Array, key: Key) -> InterventionState:
         """The learner's action, or somebody else's."""
-        acted = noise_turn(self.regulariser, state.inner.t)
+        acted = others_turn(self.regulariser, state.inner.t)
         other = self._other_action(state, key)
         inner = self.inner.begin(state.inner, jnp.where(acted[:, None], other, action), key)
         return state._replace(inner=inner, acted=acted)
@@ -156,7 +155,7 @@ class Intervention:
     def finish(self, state: InterventionState, key: Key) -> tuple[InterventionState, TimeStep]:
         """The inner step, marked with who took it and who acts next."""
         inner, step = self.inner.finish(state.inner, key)
-        next_acted = noise_turn(self.regulariser, inner.t)
+        next_acted = others_turn(self.regulariser, inner.t)
         step = step._replace(valid=step.valid & ~state.acted, handover=next_acted & ~state.acted)
         return state._replace(inner=inner, obs=step.obs), step
 
@@ -164,10 +163,14 @@ class Intervention:
         """A new episode, with a new partner."""
         inner_key, partner_key = jax.random.split(key)
         inner, obs = self.inner.restart(state.inner, mask, inner_key)
-        side = 1 + 2 * jax.random.bernoulli(partner_key, shape=(self.num_envs,)).astype(jnp.int32)
-        partner = (jnp.array(self.inner.goal_index) + side) % NUM_DIRECTIONS
+        partner = jnp.where(mask, self._draw_partners(partner_key), state.partner)
         obs = jnp.where(mask[:, None], obs, state.obs)
-        return state._replace(inner=inner, obs=obs, partner=jnp.where(mask, partner, state.partner)), obs
+        return state._replace(inner=inner, obs=obs, partner=partner), obs
+
+    def _draw_partners(self, key: Key) -> Int[Array, " N"]:
+        """For every row one of the two directions orthogonal to its own."""
+        side = 1 + 2 * jax.random.bernoulli(key, shape=(self.num_envs,)).astype(jnp.int32)
+        return (jnp.array(self.inner.goal_index) + side) % NUM_DIRECTIONS
 
     def _other_action(self, state: InterventionState, key: Key) -> Float[Array, "N 8"]:
         if isinstance(self.regulariser, AppropriateBias) and self.partners is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -156,6 +157,12 @@ def steps_per_iteration(experiment: Experiment) -> int:
     return experiment.ppo.batch_size * (experiment.option_steps if experiment.is_master else 1)
 
 
+def planned_steps(experiment: Experiment) -> int:
+    """Control steps that a run takes: as many whole iterations as ``total_steps`` holds, and at least one."""
+    per_iteration = steps_per_iteration(experiment)
+    return max(1, experiment.total_steps // per_iteration) * per_iteration
+
+
 def begin_learning(experiment: Experiment, env: Environment, seeds: tuple[int, ...]) -> Learning:
     """Fresh learners and first episodes. One root key per seed; the environment's comes from the first."""
     policy, config = experiment.policy(), experiment.ppo
@@ -213,8 +220,8 @@ def train(
     env = build_environment(experiment, len(seeds), needed, num_threads)
     learning = _resume(run, env, begin_learning(experiment, env, seeds))
     per_iteration = steps_per_iteration(experiment)
-    num_iterations = math.ceil(experiment.total_steps / per_iteration)
-    total = num_iterations * per_iteration
+    total = planned_steps(experiment)
+    num_iterations = total // per_iteration
     if learning.iteration > num_iterations:
         at = learning.iteration * per_iteration
         raise ValueError(f"{run.path} is at step {at} already: total_steps must be at least that, got {total}")
@@ -229,7 +236,7 @@ def train(
             learning, metrics = iterate(experiment, env, learning, seeds[0])
             step = learning.iteration * per_iteration
             metrics = jax.tree.map(np.asarray, metrics)
-            _check_finite(metrics, step, run)
+            _check_finite({**metrics, "parameters": _largest(learning.learners.params)}, step, run)
             rate = len(seeds) * experiment.runs_per_seed * per_iteration / (time.monotonic() - begun)
             log.write(step, {**metrics, "time/steps_per_second": rate})
             progress.update(step, _headline(experiment, metrics))
@@ -277,13 +284,20 @@ def _resume(run: RunDir, env: Environment, fresh: Learning) -> Learning:
         run.rewind(latest.step)
         return fresh
     tree, meta = checkpoint.load(latest.path, _tree(env, fresh))
+    for damage in latest.skipped:
+        warnings.warn(f"going on from step {latest.step}: {damage}", stacklevel=2)
     run.rewind(latest.step)
     env.physics.restore(tree["engine"])
     return Learning(int(meta["iteration"]), tree["learners"], tree["carry"])
 
 
+def _largest(params: Params) -> Any:
+    """The largest magnitude among all parameters; not finite if one of them is not."""
+    return np.max([np.abs(np.asarray(leaf)).max() for leaf in jax.tree.leaves(params)])
+
+
 def _check_finite(metrics: Metrics, step: int, run: RunDir) -> None:
-    for name in ("policy_loss", "value_loss", "grad_norm", "approx_kl", "entropy"):
+    for name in ("policy_loss", "value_loss", "grad_norm", "approx_kl", "entropy", "parameters"):
         if not np.isfinite(metrics[name]).all():
             last = run.latest_checkpoint().path
             kept = f"the last good checkpoint is {last}" if last else "there is no earlier checkpoint"

@@ -16,9 +16,9 @@ import jax
 
 from footwork import checkpoint
 from footwork.checkpoint import CheckpointError
-from footwork.record import RunDir, RunError, config_from_json, config_to_json
+from footwork.record import RunDir, RunError, config_from_json, config_to_json, versions
 from footwork.study.experiments import find_row, with_robot
-from footwork.train import Experiment, Trained, policy_meta, train
+from footwork.train import Experiment, Trained, planned_steps, policy_meta, train
 
 NEEDED = "needed.safetensors"
 PACKAGED = "packaged weights"
@@ -53,11 +53,15 @@ def train_row(
     _check_seeds(seeds)
     path = run_path(runs, experiment.name, seeds) if name is None else runs / experiment.name / name
     config = {"experiment": config_to_json(experiment), "seeds": list(seeds)}
-    run = _reopen(path, config) if resume and (path / "config.json").is_file() else RunDir.create(path, config)
+    if resume and (path / "config.json").is_file():
+        run = _reopen(path, config)
+    else:
+        _find_or_train_needed(experiment, runs, num_threads)  # a refusal leaves no directory behind
+        run = RunDir.create(path, config)
     with run.lock():
-        if run.finished and run.summary()["steps"] >= experiment.total_steps:
+        if run.finished and run.summary()["steps"] >= planned_steps(experiment):
             return load_run(run)
-        needed = _needed_by(experiment, run, runs, num_threads)
+        needed = _keep_needed(experiment, run, runs, num_threads)
         return train(experiment, seeds, run, needed, num_threads, tensorboard=tensorboard)
 
 
@@ -75,6 +79,12 @@ def _reopen(path: Path, config: dict[str, Any]) -> RunDir:
     old = run.config()
     if _without_length(old) != _without_length(config):
         raise ValueError(f"{path} was begun with another config: resume with that one, or choose another --name")
+    then, now = run.versions(), versions()
+    for name in ("jax", "mujoco"):  # with another, the numbers would not be those of an uninterrupted run
+        if then.get(name) != now[name]:
+            raise ValueError(
+                f"{path} was begun with {name} {then.get(name)}, this is {now[name]}: use that, or begin anew"
+            )
     return run
 
 
@@ -83,22 +93,29 @@ def _without_length(config: dict[str, Any]) -> dict[str, Any]:
     return {**config, "experiment": experiment}
 
 
-def _needed_by(experiment: Experiment, run: RunDir, runs: Path, num_threads: int) -> Trained | None:
-    """The policies a run stands on: those it kept, else found or trained now, and then kept."""
+def _find_or_train_needed(experiment: Experiment, runs: Path, num_threads: int) -> Trained | None:
+    """The policies that a new run would stand on, trained now where there are none."""
     if experiment.needs is None:
         return None
-    kept = run.path / NEEDED
-    if kept.is_file():
-        return load_policies(kept)
     try:
         needed = find_trained(experiment.needs, runs)
     except RunError:
         row = with_robot(find_row(experiment.needs), experiment.task.robot)
         needed = train_row(row, (0,), runs, resume=True, num_threads=num_threads)
     _check_fit(experiment, needed)
-    first = jax.tree.map(lambda leaf: leaf[:1], needed.params)
-    meta = {**policy_meta(needed.experiment, needed.seeds[:1], needed.experiment.total_steps), "from": needed.source}
-    checkpoint.save(kept, first, meta)
+    return needed
+
+
+def _keep_needed(experiment: Experiment, run: RunDir, runs: Path, num_threads: int) -> Trained | None:
+    """The policies a run stands on: those it kept, else found or trained now, and then kept."""
+    kept = run.path / NEEDED
+    if not kept.is_file():
+        needed = _find_or_train_needed(experiment, runs, num_threads)
+        if needed is None:
+            return None
+        first = jax.tree.map(lambda leaf: leaf[:1], needed.params)
+        meta = policy_meta(needed.experiment, needed.seeds[:1], planned_steps(needed.experiment))
+        checkpoint.save(kept, first, {**meta, "from": needed.source})
     return load_policies(kept)
 
 

@@ -64,6 +64,8 @@ class Task:
             raise ValueError(f"goal_radius must be > 0, got {self.goal_radius}")
         if self.potential == "geodesic" and len(self.arena.goals) != 1:
             raise ValueError(f"a geodesic potential needs one goal, {self.arena.name} has {len(self.arena.goals)}")
+        if self.potential == "geodesic":
+            _ = self._distance_field  # refuse now what cannot be tabulated
 
     @property
     def obs_size(self) -> int:

@@ -16,7 +16,15 @@ from footwork.learn.gae import gae
 from footwork.learn.networks import Categorical, Gaussian, categorical_policy, gaussian_policy
 from footwork.types import Transition
 
-SMALL = PPOConfig(num_envs=4, num_steps=6, update_epochs=2, num_minibatches=3, hidden_sizes=(8, 8), learning_rate=1e-2)
+SMALL = PPOConfig(
+    num_envs=4,
+    num_steps=6,
+    update_epochs=2,
+    num_minibatches=3,
+    hidden_sizes=(8, 8),
+    learning_rate=1e-2,
+    ent_coef=0.0,
+)
 PROBE = PPOConfig(
     num_envs=8,
     num_steps=64,
@@ -82,7 +90,7 @@ def test_paper_is_table_1():
     table = (PAPER.learning_rate, PAPER.gamma, PAPER.gae_lambda, PAPER.clip_eps, PAPER.vf_coef)
     assert table == (3e-4, 0.99, 0.95, 0.2, 0.5)
     assert (PAPER.update_epochs, PAPER.num_minibatches, PAPER.batch_size) == (10, 32, 2048)
-    assert (PAPER.loss, PAPER.ent_coef, PAPER.max_grad_norm, PAPER.minibatch_size) == ("clip", 0.0, None, None)
+    assert (PAPER.loss, PAPER.max_grad_norm, PAPER.minibatch_size) == ("clip", None, None)
 
 
 @pytest.mark.parametrize(

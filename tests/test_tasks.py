@@ -362,7 +362,7 @@ def test_a_weight_scales_its_term_alone():
     factor = {name: 2.0 + i for i, name in enumerate(plain)}
     weights = RewardWeights(**{name: factor[name] * getattr(EVERY_TERM, name) for name in factor})
     scaled = pay(replace(ANT_WALKER, weights=weights), qpos=qpos, **hard)
-    assert set(scaled) == set(vars(weights))
+    assert set(scaled) == set(vars(weights)) - {"goal"}  # nobody arrives on a task without a goal radius
     assert scaled == pytest.approx({name: factor[name] * value for name, value in plain.items()})
 
 

@@ -1,0 +1,215 @@
+"""Every row of the table trains; what a run refuses. (Resuming bit for bit: test_resume.py.)"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from footwork import checkpoint
+from footwork import train as training
+from footwork.record import RunDir, RunError, config_to_json, read_metrics
+from footwork.study.experiments import EXPERIMENTS, find_row
+from footwork.study.runs import find_trained, run_path, train_row
+from footwork.train import Interrupted, Trained, begin_learning, build_environment, iterate, steps_per_iteration
+
+
+def tiny(row, iterations=1):
+    """The row as the table has it, but for its sizes."""
+    experiment = EXPERIMENTS[row]
+    ppo = replace(
+        experiment.ppo,
+        num_envs=4,
+        num_steps=3,
+        num_minibatches=2,
+        minibatch_size=None,
+        update_epochs=1,
+        hidden_sizes=(4,),
+    )
+    task = replace(experiment.task, episode_steps=4)
+    small = replace(experiment, ppo=ppo, task=task, option_steps=2)
+    return replace(small, total_steps=iterations * steps_per_iteration(small))
+
+
+def untrained(row, seeds=(0,)):
+    """Policies of a row that have learned nothing."""
+    experiment = tiny(row)
+    shapes = jax.eval_shape(experiment.policy().init, jax.random.key(0))
+    lead = (len(seeds), experiment.runs_per_seed)
+    return Trained(experiment, seeds, jax.tree.map(lambda leaf: jnp.zeros((*lead, *leaf.shape)), shapes), "nowhere")
+
+
+def needed_by(experiment):
+    return None if experiment.needs is None else untrained(experiment.needs)
+
+
+# ---------------------------------------------------------------- the table
+
+
+def structure(row):
+    """What makes one row's program differ from another's: the values of its fields, without sizes and weights."""
+    experiment = tiny(row)
+    task = experiment.task
+    return {
+        ("task", task.name, task.potential, experiment.is_master),
+        ("learner", type(experiment.regulariser).__name__, experiment.symmetric, experiment.is_master),
+        ("rule", task.fall_rule, task.goal_radius is None),
+        ("loss", experiment.ppo.loss),
+    }
+
+
+def representatives():
+    """Rows among which every such value occurs, each bringing one that those before it do not have."""
+    chosen, met = [], set()
+    for row in EXPERIMENTS:
+        if structure(row) - met:
+            chosen.append(row)
+            met |= structure(row)
+    return chosen
+
+
+@pytest.mark.parametrize("row", representatives())
+def test_a_row_trains(row):
+    experiment = tiny(row)
+    env = build_environment(experiment, 1, needed_by(experiment), 1)
+    learning = begin_learning(experiment, env, (0,))
+    after, metrics = iterate(experiment, env, learning, 0)
+    assert after.iteration == 1
+    assert (np.asarray(after.learners.num_updates) == 1).all()
+    for name in ("policy_loss", "value_loss", "entropy", "approx_kl", "grad_norm", "rollout/progress"):
+        assert np.isfinite(metrics[name]).all(), name
+        assert metrics[name].shape == (experiment.runs_per_seed,)
+    moved = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), after.learners.params, learning.learners.params)
+    learned = np.asarray(metrics["valid_fraction"]).any()
+    assert any(jax.tree.leaves(moved)) == learned
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after.learners.params))
+
+
+def test_every_row_builds_its_environment_and_its_policy():
+    for row in EXPERIMENTS:
+        experiment = tiny(row)
+        assert (find_row(row).name, experiment.name) == (row, row)
+        env = build_environment(experiment, 2, needed_by(experiment), 1)
+        assert env.num_envs == 2 * 4 * experiment.runs_per_seed
+        assert experiment.policy().obs_size == experiment.task.obs_size
+        assert experiment.needs is None or experiment.needs in EXPERIMENTS
+        if experiment.needs is not None:
+            with pytest.raises(ValueError, match=f"needs the policies of {experiment.needs}"):
+                build_environment(experiment, 1, None)
+
+
+def test_rows_say_how_many_steps_they_take():
+    for row, experiment in EXPERIMENTS.items():
+        assert steps_per_iteration(experiment) <= experiment.total_steps, row
+    walker, master = tiny("walker/plain"), tiny("maze/hrl/plain")
+    assert (steps_per_iteration(walker), steps_per_iteration(master)) == (12, 24)
+
+
+# ---------------------------------------------------------------- runs
+
+
+def test_an_interrupted_run_goes_on_as_if_it_had_not_been(tmp_path, monkeypatch):
+    """Of a master, with the sub-policies that it stands on."""
+    row, needs = "bandit/hrl/plain", "walker/plain"
+    for place in ("whole", "parts"):
+        path = run_path(tmp_path / place, needs, (0,))
+        run = RunDir.create(path, {})
+        walker = untrained(needs)
+        run.save_policy(walker.params, training.policy_meta(walker.experiment, (0,), 0))
+        run.finish({"steps": 0})
+    train_row(tiny(row, 4), (0,), tmp_path / "whole", num_threads=1)
+    real, steps = training.iterate, []
+
+    def interrupted(*arguments):
+        steps.append(1)
+        if len(steps) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return real(*arguments)
+
+    monkeypatch.setattr(training, "iterate", interrupted)
+    with pytest.raises(Interrupted, match=r"stopped at step 48 of 96; saved in .*, go on with --resume"):
+        train_row(tiny(row, 4), (0,), tmp_path / "parts", num_threads=1)
+    monkeypatch.setattr(training, "iterate", real)
+    with pytest.raises(RunError, match="holds an unfinished run: use --resume"):
+        train_row(tiny(row, 4), (0,), tmp_path / "parts", num_threads=1)
+    train_row(tiny(row, 4), (0,), tmp_path / "parts", resume=True, num_threads=2)
+    ends = []
+    for place in ("whole", "parts"):
+        run = RunDir(run_path(tmp_path / place, row, (0,)))
+        arrays, _ = checkpoint.load_arrays(run.policy_path)
+        metrics = [
+            {k: v for k, v in line.items() if not k.startswith("time/")} for line in read_metrics(run.metrics_path)
+        ]
+        ends.append((arrays, json.dumps(metrics)))
+    for name, array in ends[0][0].items():
+        np.testing.assert_array_equal(array, ends[1][0][name], err_msg=name)
+    assert ends[0][1] == ends[1][1]
+    assert find_trained(row, tmp_path / "parts").experiment == tiny(row, 4)
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from footwork.record import RunDir
+run = RunDir(Path(sys.argv[1]))
+with run.lock():
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_run_in_use_is_left_alone(tmp_path):
+    experiment = tiny("walker/symmetric")
+    config = {"experiment": config_to_json(experiment), "seeds": [0]}
+    run = RunDir.create(run_path(tmp_path, experiment.name, (0,)), config)
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(run.path)], stdout=subprocess.PIPE)
+    try:
+        assert process.stdout.readline() == b"held\n"
+        before = sorted(path.name for path in run.path.iterdir())
+        with pytest.raises(RunError, match=f"is in use by process {process.pid}"):
+            train_row(experiment, (0,), tmp_path, resume=True)
+        assert sorted(path.name for path in run.path.iterdir()) == before
+    finally:
+        process.kill()
+        process.wait()
+    with run.lock():  # a killed process lets go
+        pass
+
+
+def test_unknown_and_untrained_rows_are_named(tmp_path):
+    with pytest.raises(ValueError, match=r"unknown row 'walker/fast'; known rows: walker/plain, ") as caught:
+        find_trained("walker/fast", tmp_path)
+    assert all(row in str(caught.value) for row in EXPERIMENTS)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "message"),
+    [((), "seeds must be one or more"), ((1, 1), "seeds must be one or more"), ((-1,), "a seed must be in 0")],
+)
+def test_bad_seeds_are_refused(tmp_path, seeds, message):
+    with pytest.raises(ValueError, match=message):
+        train_row(tiny("walker/plain"), seeds, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("row", "change", "message"),
+    [
+        ("walker/plain", {"total_steps": 0}, "total_steps must be >= 1, got 0"),
+        ("maze/hrl/plain", {"option_steps": 0}, "option_steps must be >= 1, got 0"),
+        ("maze/flat/free", {"regulariser": EXPERIMENTS["walker/random-start"].regulariser}, "only sub-policies are"),
+    ],
+)
+def test_bad_fields_of_a_row_are_refused(row, change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(EXPERIMENTS[row], **change)

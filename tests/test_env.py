@@ -27,10 +27,12 @@ from footwork.regularisers import (
     RandomStart,
     Symmetric,
     directions_of_rows,
+    expect_handovers,
     regularise,
 )
 from footwork.study.experiments import ANT_MAZE, ANT_WALKER
 from footwork.tasks.observe import observe_walker, turn_action, turn_observation
+from footwork.types import Transition
 
 N = 8
 CONFIG = PPOConfig(hidden_sizes=(4,))
@@ -345,6 +347,35 @@ def test_the_learned_orthogonal_policies_lead_in():
 
 
 # ---------------------------------------------------------------- changing hands
+
+
+def rollout_of(obs):
+    flat = jnp.zeros(obs.shape[:-1])
+    return Transition(obs, flat, flat, flat, flat > 0, flat > 0, obs, flat == 0)
+
+
+def test_every_direction_hears_what_the_other_three_expect():
+    two_seeds = constant_policies(np.zeros(8)).params
+    critic = jnp.arange(8.0)[:, None] ** 2  # runs: seed, then direction
+    two_seeds = {**two_seeds, "critic": jax.tree.map(jnp.zeros_like, two_seeds["critic"])}
+    two_seeds["critic"]["output"]["bias"] = critic
+    rollout = rollout_of(jnp.zeros((8, 3, 2, 32)))
+    handovers = expect_handovers(Interleaved(mean_steps=30), False, POLICY, two_seeds, rollout).handovers
+    others = [np.mean([r**2 for r in range(4 * (i // 4), 4 * (i // 4) + 4) if r != i]) for i in range(8)]
+    np.testing.assert_allclose(handovers.value, np.broadcast_to(np.reshape(others, (8, 1, 1)), (8, 3, 2)), rtol=1e-6)
+    np.testing.assert_allclose(handovers.chance, 0.75 / 30)
+
+
+def test_a_symmetric_policy_expects_what_it_would_in_the_other_frames():
+    params = jax.vmap(POLICY.init)(jax.random.split(jax.random.key(1), 1))
+    obs = jax.random.normal(jax.random.key(2), (1, 3, 2, 32))
+    handovers = expect_handovers(Interleaved(mean_steps=30), True, POLICY, params, rollout_of(obs)).handovers
+    only = jax.tree.map(lambda leaf: leaf[0], params)
+    for index in np.ndindex(3, 2):
+        row = obs[0][index][None]
+        values = [POLICY.value(only, turn(row, jnp.array([quarter]))) for quarter in (1, 2, 3)]
+        assert handovers.value[0][index] == pytest.approx(np.mean(values), rel=1e-3, abs=1e-5)
+    np.testing.assert_allclose(handovers.chance, 1 / 30)
 
 
 @pytest.fixture(scope="module")

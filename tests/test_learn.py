@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from footwork.learn import ppo
 from footwork.learn.config import PAPER, PPOConfig
 from footwork.learn.gae import gae
 from footwork.learn.networks import Categorical, Gaussian, categorical_policy, gaussian_policy
-from footwork.types import Transition
+from footwork.types import Handovers, Transition
 
 SMALL = PPOConfig(
     num_envs=4,
@@ -154,6 +155,26 @@ def test_gae_keeps_rows_apart_and_nan_behind_an_end():
     advantage, _ = advantages(reward, value, next_value, terminated, jnp.zeros((2, 2), bool), 0.5, 0.5)
     assert advantage[0, 0] == 1.0  # a death's successor and the next episode do not matter
     np.testing.assert_allclose(advantage[:, 1], (5.5 + 0.25 * 8.0, 8.0))
+
+
+def test_expected_handovers_are_the_mean_over_their_outcomes():
+    """With lambda 1 a return is that of the rows which the chance spares, and of those that it does not, by odds."""
+    config = replace(SMALL, gamma=0.9, gae_lambda=1.0)
+    policy, state, rollout = started("gaussian", config)
+    never = jnp.zeros_like(rollout.terminated)
+    other_value = jax.random.normal(jax.random.key(5), never.shape)
+    chance = jnp.full(never.shape, 0.3)
+    next_obs = jnp.concatenate((rollout.obs[1:], rollout.next_obs[-1:]))
+    rollout = rollout._replace(terminated=never, truncated=never, next_obs=next_obs)
+    rollout = rollout._replace(handovers=Handovers(chance, other_value))
+    expected = digest(policy, config, state.params, rollout)[0].return_.reshape(never.shape)
+    last_value = policy.value(state.params, rollout.next_obs[-1])
+    outcome = 0.0  # of the first step's return: taken over after step k, or never
+    for k in range(config.num_steps):
+        earned = sum(config.gamma**i * rollout.reward[i] for i in range(k + 1))
+        outcome += 0.3 * 0.7**k * (earned + config.gamma ** (k + 1) * other_value[k])
+    outcome += 0.7**config.num_steps * (earned + config.gamma**config.num_steps * last_value)
+    np.testing.assert_allclose(expected[0], outcome, rtol=1e-4, atol=1e-5)
 
 
 # ---------------------------------------------------------------- heads
@@ -385,7 +406,7 @@ def test_the_clip_lets_go_only_beyond_a_gain(advantage, old_is_lower, pulls):
     samples, valid, _ = digest(policy, SMALL, state.params, rollout)
     shift = -0.4 if old_is_lower else 0.4  # ratios of 1.49 and 0.67, both outside 0.8..1.2
     samples = samples._replace(log_prob=samples.log_prob + shift, advantage=advantage * jnp.ones_like(samples.return_))
-    (_, metrics), gradient = loss_and_gradient(policy, SMALL, state.params, samples, valid, state.kl_coef)
+    (_, metrics), gradient = loss_and_gradient(policy, SMALL, state.params, samples, valid, state.kl_coef, 0.0)
     assert metrics["clip_fraction"] == 1.0
     assert any(np.any(leaf) for leaf in jax.tree.leaves(gradient["actor"])) == pulls
 
@@ -406,12 +427,41 @@ def test_the_entropy_bonus_widens_the_policy():
     samples = samples._replace(advantage=jnp.zeros_like(samples.advantage))  # nothing but entropy to gain
 
     def pull(ent_coef):
-        config = replace(SMALL, ent_coef=ent_coef)
-        _, gradient = loss_and_gradient(policy, config, state.params, samples, valid, state.kl_coef)
+        _, gradient = loss_and_gradient(policy, SMALL, state.params, samples, valid, state.kl_coef, ent_coef)
         return gradient["actor"]["output"]["bias"][2:]  # the raw deviations
 
     np.testing.assert_array_equal(pull(0.0), 0.0)
     assert jnp.all(pull(0.5) < 0.0)  # descent raises them
+
+
+def test_the_entropy_bonus_falls_to_nothing():
+    annealed = replace(SMALL, ent_coef=0.5, anneal_updates=10, final_learning_rate_share=1.0)
+    policy, state, rollout = started("gaussian", annealed)
+
+    def learned(config, num_updates):
+        later = state._replace(num_updates=jnp.int32(num_updates))
+        after, _ = update(policy, config, later, rollout, jax.random.key(0))
+        return ravel_pytree(after.params)[0]
+
+    for updates, share in ((0, 1.0), (5, 0.5), (10, 0.0), (1000, 0.0)):
+        constant = learned(replace(SMALL, ent_coef=0.5 * share), updates)
+        np.testing.assert_allclose(learned(annealed, updates), constant, atol=1e-6)
+    assert not np.allclose(learned(annealed, 0), learned(annealed, 5), atol=1e-5)
+
+
+def test_the_learning_rate_falls_to_its_last_share():
+    annealed = replace(SMALL, update_epochs=1, num_minibatches=1, anneal_updates=4, final_learning_rate_share=0.25)
+    policy, state, rollout = started("gaussian", annealed)
+
+    def step_size(config, num_updates):
+        """The first step of Adam is the learning rate long in every parameter that has a gradient."""
+        later = state._replace(num_updates=jnp.int32(num_updates))
+        after, _ = update(policy, config, later, rollout, jax.random.key(0))
+        return np.abs(ravel_pytree(after.params)[0] - ravel_pytree(state.params)[0]).max()
+
+    constant = step_size(replace(annealed, anneal_updates=None), 0)
+    shares = [step_size(annealed, updates) / constant for updates in (0, 2, 4, 1000)]
+    assert shares == pytest.approx([1.0, 0.625, 0.25, 0.25], rel=1e-2)
 
 
 def test_the_penalty_charges_for_distance_from_the_old_policy():
@@ -421,7 +471,7 @@ def test_the_penalty_charges_for_distance_from_the_old_policy():
     old_outputs = samples.old_outputs.at[:, 0].add(0.6)  # at a deviation of 1: a divergence of 0.6^2 / 2
     samples = samples._replace(old_outputs=old_outputs, advantage=jnp.zeros_like(samples.advantage))
     for kl_coef in (0.0, 1.0, 3.0):
-        (_, metrics), _ = loss_and_gradient(policy, config, state.params, samples, valid, jnp.float32(kl_coef))
+        (_, metrics), _ = loss_and_gradient(policy, config, state.params, samples, valid, jnp.float32(kl_coef), 0.0)
         assert metrics["policy_loss"] == pytest.approx(0.18 * kl_coef, rel=0.05)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -18,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from footwork.env import Env, EnvState
+from footwork.learn.networks import Policy
 from footwork.options import SubPolicies
 from footwork.tasks.observe import turn_action, turn_observation
-from footwork.types import Array, Bool, Float, Int, Key, Physics, TimeStep
+from footwork.types import Array, Bool, Float, Handovers, Int, Key, Params, Physics, TimeStep, Transition
 
 NUM_DIRECTIONS = 4
 
@@ -70,12 +72,18 @@ class Interleaved:
     """Ours: the directions train together, and ants change hands between them at random times.
 
     Every policy so learns from the states that the others really leave behind. At every
-    ``every``-th step each ant changes hands with a probability that makes a stay last
-    ``mean_steps`` on average. With a symmetric policy the ant changes direction instead.
+    ``every``-th step each ant is up for exchange with a probability that makes a stay last
+    ``mean_steps`` on average; an exchange among four directions brings one in four ants
+    back to its own, so that its stays with one direction last a third longer. With a
+    symmetric policy the ant changes direction instead.
+
+    With ``cooperative`` a policy also cares for what it leaves behind: its returns count
+    the chance of a hand-over, and what the ant is then worth to the others.
     """
 
-    mean_steps: int = 64
+    mean_steps: int = 40
     every: int = 8
+    cooperative: bool = True
 
     def __post_init__(self) -> None:
         _at_least(1, mean_steps=self.mean_steps, every=self.every)
@@ -335,6 +343,47 @@ def regularise(
     if isinstance(regulariser, Interleaved):
         return Interleave(env, regulariser, num_groups)
     return Intervention(env, regulariser, partners)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def expect_handovers(
+    regulariser: Interleaved, symmetric: bool, policy: Policy, params: Params, transition: Transition
+) -> Transition:
+    """Tell every learner what the others expect of its ants, should they take over.
+
+    Args:
+        regulariser: how often they do.
+        symmetric: one policy in four frames, instead of four policies per seed.
+        policy: the network common to all runs.
+        params: leading axis R: the seeds, and within each its directions.
+        transition: axes [R, T, n, ...].
+
+    Returns:
+        The transition with its ``handovers``: per control step the chance of going to
+        another direction, and the mean of the three other directions' values.
+    """
+    if symmetric:
+        value = jax.vmap(partial(_value_in_other_frames, policy))(params, transition.next_obs)
+        chance = 1.0 / regulariser.mean_steps
+    else:
+        by_seed = lambda leaf: leaf.reshape(-1, NUM_DIRECTIONS, *leaf.shape[1:])  # noqa: E731
+        by_seeds = jax.tree.map(by_seed, (params, transition.next_obs))
+        value = jax.vmap(partial(_value_to_other_directions, policy))(*by_seeds).reshape(transition.reward.shape)
+        chance = (NUM_DIRECTIONS - 1) / NUM_DIRECTIONS / regulariser.mean_steps  # the exchange may bring one's own
+    return transition._replace(handovers=Handovers(jnp.full_like(value, chance), value))
+
+
+def _value_in_other_frames(policy: Policy, params: Params, obs: Float[Array, "T N 32"]) -> Float[Array, "T N"]:
+    rows = obs.reshape(-1, obs.shape[-1])
+    turns = jnp.arange(1, NUM_DIRECTIONS)[:, None].repeat(rows.shape[0], axis=1)
+    value = policy.value(params, jax.vmap(turn_observation, in_axes=(None, 0))(rows, turns))
+    return value.mean(axis=0).reshape(obs.shape[:-1])
+
+
+def _value_to_other_directions(policy: Policy, params: Params, obs: Float[Array, "4 T N 32"]) -> Float[Array, "4 T N"]:
+    value = jax.vmap(policy.value, in_axes=(0, None))(params, obs)  # axes: who values, whose ant
+    own = jnp.diagonal(value).transpose(2, 0, 1)
+    return (value.sum(axis=0) - own) / (NUM_DIRECTIONS - 1)
 
 
 def directions_of_rows(num_envs: int, directions: Sequence[int]) -> tuple[int, ...]:

@@ -27,7 +27,14 @@ from footwork.learn.networks import Policy, categorical_policy, gaussian_policy
 from footwork.options import Options, SubPolicies
 from footwork.physics.batch import BatchPhysics
 from footwork.record import Progress, RunDir, config_to_json, versions
-from footwork.regularisers import AppropriateBias, Regulariser, directions_of_rows, regularise
+from footwork.regularisers import (
+    AppropriateBias,
+    Interleaved,
+    Regulariser,
+    directions_of_rows,
+    expect_handovers,
+    regularise,
+)
 from footwork.tasks.task import Task
 from footwork.types import Key, Metrics, Params, Transition
 
@@ -188,6 +195,9 @@ def iterate(experiment: Experiment, env: Environment, learning: Learning, seed: 
     carry, transition, metrics = collect(
         env, policy, learning.learners.params, learning.carry, collect_key, config.num_steps
     )
+    regulariser = experiment.regulariser
+    if isinstance(regulariser, Interleaved) and regulariser.cooperative:
+        transition = expect_handovers(regulariser, experiment.symmetric, policy, learning.learners.params, transition)
     learners, update_metrics = update_all(policy, config, learning.learners, transition, update_key)
     return Learning(learning.iteration + 1, learners, carry), {**metrics, **update_metrics}
 

@@ -96,6 +96,13 @@ class TimeStep(NamedTuple):
     events: dict[str, Any]  # counted, never learned from: fallen, flipped, diverged, distances
 
 
+class Handovers(NamedTuple):
+    """What a learner expects of others who may take its rows over: every leaf has axes [T, N]."""
+
+    chance: Float[Array, "T N"]  # that somebody else acts from the step's successor on
+    value: Float[Array, "T N"]  # of that successor to them, in the learner's (scaled) reward
+
+
 class Transition(NamedTuple):
     """A rollout as a learner sees it: every leaf has axes [T, N, ...]."""
 
@@ -107,6 +114,7 @@ class Transition(NamedTuple):
     truncated: Bool[Array, "T N"]  # truncation or hand-over: the sum stops, the value goes on
     next_obs: Float[Array, "T N D"]
     valid: Bool[Array, "T N"]
+    handovers: Handovers | None = None  # None: what others make of a successor is none of the learner's concern
 
 
 __all__ = [
@@ -117,6 +125,7 @@ __all__ = [
     "Array",
     "Bool",
     "Float",
+    "Handovers",
     "Int",
     "Key",
     "Metrics",

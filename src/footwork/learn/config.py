@@ -36,6 +36,9 @@ class PPOConfig:
     ent_coef: float = (
         0.02  # times the entropy, added to the objective; at 0 half of the walkers never leave their stand
     )
+    anneal_updates: int | None = None  # updates in which ent_coef and learning_rate fall linearly; None: both stay
+    final_ent_coef_share: float = 0.0  # of ent_coef, when annealed
+    final_learning_rate_share: float = 0.1  # of learning_rate, when annealed
     max_grad_norm: float | None = None  # the gradient is scaled down to this norm; None leaves it alone
     normalize_advantage: bool = True  # to mean 0 and deviation 1 over all valid samples of the update
     adam_eps: float = 1e-5
@@ -49,13 +52,16 @@ class PPOConfig:
     def __post_init__(self) -> None:
         for name in ("update_epochs", "num_minibatches", "num_envs", "num_steps"):
             _check_count(name, getattr(self, name))
-        if self.minibatch_size is not None:
-            _check_count("minibatch_size", self.minibatch_size)
+        for name in ("minibatch_size", "anneal_updates"):
+            if getattr(self, name) is not None:
+                _check_count(name, getattr(self, name))
         for name in ("learning_rate", "clip_eps", "adam_eps", "reward_scale", "target_kl", "initial_kl_coef"):
             _check_range(name, getattr(self, name), above=0.0)
         if self.max_grad_norm is not None:
             _check_range("max_grad_norm", self.max_grad_norm, above=0.0)
         for name in ("gamma", "gae_lambda"):
+            _check_range(name, getattr(self, name), at_least=0.0, at_most=1.0)
+        for name in ("final_ent_coef_share", "final_learning_rate_share"):
             _check_range(name, getattr(self, name), at_least=0.0, at_most=1.0)
         for name in ("vf_coef", "ent_coef"):
             _check_range(name, getattr(self, name), at_least=0.0)

@@ -15,7 +15,7 @@ def gae(
     terminated: Bool[Array, "T N"],
     truncated: Bool[Array, "T N"],
     gamma: float,
-    gae_lambda: float,
+    gae_lambda: float | Float[Array, "T N"],
 ) -> tuple[Float[Array, "T N"], Float[Array, "T N"]]:
     """Advantages, and the returns (advantage + value) that the critic is fitted to.
 
@@ -23,16 +23,19 @@ def gae(
     shifted here and a reset between two steps does no harm. A terminated step has no
     future; a truncated one has the future that ``next_value`` promises. The sum over
     later steps ends at either. What lies beyond such an end is left out by selection
-    and not by a factor of zero: it may be NaN, and stays without effect.
+    and not by a factor of zero: it may be NaN, and stays without effect. ``gae_lambda``
+    may differ from step to step.
     """
     delta = reward + gamma * jnp.where(terminated, 0.0, next_value) - value
+    decay = jnp.broadcast_to(gamma * gae_lambda, delta.shape)
 
-    def step_back(later: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
-        delta_t, ends = now
-        advantage = delta_t + jnp.where(ends, 0.0, gamma * gae_lambda * later)
+    def step_back(later: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        delta_t, decay_t, ends = now
+        advantage = delta_t + jnp.where(ends, 0.0, decay_t * later)
         return advantage, advantage
 
-    _, advantage = jax.lax.scan(step_back, jnp.zeros_like(delta[0]), (delta, terminated | truncated), reverse=True)
+    steps = (delta, decay, terminated | truncated)
+    _, advantage = jax.lax.scan(step_back, jnp.zeros_like(delta[0]), steps, reverse=True)
     return advantage, advantage + value
 
 

@@ -64,17 +64,20 @@ def update(
     index, mask = minibatches(valid, num_minibatches, config.update_epochs, key)
     vector, unravel = ravel_pytree(train_state.params)
     optimizer = _optimizer(config)
+    ent_coef = config.ent_coef * anneal(config, config.final_ent_coef_share, train_state.num_updates)
+    step_scale = anneal(config, config.final_learning_rate_share, train_state.num_updates)
+    coefs = (train_state.kl_coef, ent_coef)
 
     # One vector of parameters makes Adam one fused loop in place of twelve small ones.
     def take_step(carry: tuple[Array, Any], minibatch: tuple[Array, Array]) -> tuple[tuple[Array, Any], Metrics]:
         index, mask = minibatch
         batch = jax.tree.map(lambda x: x[index], samples)
         gradient_of = jax.value_and_grad(loss, argnums=2, has_aux=True)
-        (_, step_metrics), gradient = gradient_of(policy, config, unravel(carry[0]), batch, mask, train_state.kl_coef)
+        (_, step_metrics), gradient = gradient_of(policy, config, unravel(carry[0]), batch, mask, *coefs)
         gradient = ravel_pytree(gradient)[0]
         change, opt_state = optimizer.update(gradient, carry[1])
         step_metrics["grad_norm"] = jnp.linalg.norm(gradient)
-        moved = (carry[0] + change, opt_state)
+        moved = (carry[0] + step_scale * change, opt_state)
         return jax.tree.map(lambda new, old: jnp.where(mask[0], new, old), moved, carry), step_metrics
 
     one_epoch = partial(jax.lax.scan, take_step)
@@ -96,9 +99,16 @@ def digest(
     """Advantages and returns of a rollout, flattened; with the mask of its valid samples and metrics of the whole.
 
     The sum of later rewards also ends before a step that is not valid, so that what
-    somebody else earned never counts for the learner.
+    somebody else earned never counts for the learner. Where others may take a row over,
+    the expectation over that chance stands in place of its outcome: a successor is worth
+    the mixture of both values, and later rewards count as far as they are still the learner's.
     """
     value, next_value = policy.value(params, jnp.stack((transition.obs, transition.next_obs)))
+    gae_lambda: Any = config.gae_lambda
+    if transition.handovers is not None:
+        chance, other_value = transition.handovers
+        next_value = next_value + chance * (other_value - next_value)
+        gae_lambda = gae_lambda * (1.0 - chance)
     next_valid = jnp.concatenate((transition.valid[1:], jnp.ones_like(transition.valid[:1])))
     advantage, return_ = gae(
         config.reward_scale * transition.reward,
@@ -107,7 +117,7 @@ def digest(
         transition.terminated,
         transition.truncated | ~next_valid,
         config.gamma,
-        config.gae_lambda,
+        gae_lambda,
     )
     valid = transition.valid
     std = jnp.sqrt(_variance(advantage, valid))
@@ -152,11 +162,12 @@ def loss(
     batch: Samples,
     mask: Bool[Array, " B"],
     kl_coef: Float[Array, ""],
+    ent_coef: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Metrics]:
     """The objective of one minibatch, to be minimised, and its parts.
 
     Policy surrogate + vf_coef * squared error of the value - ent_coef * entropy, each a
-    mean over the samples in ``mask``.
+    mean over the samples in ``mask``. The two coefficients move from update to update.
     """
     outputs = policy.outputs(params, batch.obs)
     log_ratio = policy.head.log_prob(outputs, batch.action) - batch.log_prob
@@ -173,8 +184,15 @@ def loss(
         "approx_kl": _mean(ratio - 1.0 - log_ratio, mask),
         "clip_fraction": _mean((jnp.abs(ratio - 1.0) > config.clip_eps).astype(ratio.dtype), mask),
     }
-    total = metrics["policy_loss"] + config.vf_coef * metrics["value_loss"] - config.ent_coef * metrics["entropy"]
+    total = metrics["policy_loss"] + config.vf_coef * metrics["value_loss"] - ent_coef * metrics["entropy"]
     return total, metrics
+
+
+def anneal(config: PPOConfig, final_share: float, num_updates: Int[Array, ""]) -> Float[Array, ""]:
+    """The factor of a coefficient after ``num_updates`` updates: 1, or on its linear way to ``final_share``."""
+    if config.anneal_updates is None:
+        return jnp.float32(1.0)
+    return 1.0 - (1.0 - final_share) * jnp.minimum(1.0, num_updates / config.anneal_updates)
 
 
 def adapt_kl_coef(kl_coef: Float[Array, ""], kl: Float[Array, ""], target_kl: float) -> Float[Array, ""]:
@@ -201,4 +219,4 @@ def _variance(x: Float[Array, "..."], mask: Bool[Array, "..."]) -> Float[Array, 
     return _mean((x - _mean(x, mask)) ** 2, mask)
 
 
-__all__ = ["Samples", "TrainState", "adapt_kl_coef", "digest", "init", "loss", "minibatches", "update"]
+__all__ = ["Samples", "TrainState", "adapt_kl_coef", "anneal", "digest", "init", "loss", "minibatches", "update"]

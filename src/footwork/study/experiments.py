@@ -41,7 +41,7 @@ ANT_MAZE = Task(
 )
 
 WALKER_STEPS = 2_000_000  # control steps per direction; not in the paper
-SYMMETRIC_STEPS = 4 * WALKER_STEPS  # one policy with the experience of four
+SYMMETRIC_STEPS = 2 * WALKER_STEPS  # of one policy, in four directions: half of what four take
 FLAT_STEPS = 10_000_000  # as many as four sub-policies and a master together
 
 # The master makes few decisions, and each is worth the sum of k rewards: more rows, a larger step, smaller numbers.
@@ -50,17 +50,29 @@ MASTER_PPO = replace(PAPER, num_envs=64, num_steps=4, num_minibatches=8, learnin
 PAPER_MASTER_MAZE = replace(PAPER, num_envs=8, num_steps=16)
 PAPER_MASTER_BANDIT = replace(PAPER, num_envs=8, num_steps=5)
 
+
+def _annealed(total_steps: int) -> PPOConfig:
+    """Ours: the entropy bonus ends, and steps shrink, over the whole training; with Table 1 alone late updates undo."""
+    return replace(PAPER, anneal_updates=total_steps // PAPER.batch_size)
+
+
 WALKERS: tuple[Experiment, ...] = (
     Experiment("walker/plain", ANT_WALKER, PAPER, WALKER_STEPS),
     Experiment("walker/random-start", ANT_WALKER, PAPER, WALKER_STEPS, RandomStart()),
     Experiment("walker/random-repeated", ANT_WALKER, PAPER, WALKER_STEPS, RandomRepeated()),
     Experiment("walker/appropriate-bias", ANT_WALKER, PAPER, WALKER_STEPS, AppropriateBias()),
-    Experiment("walker/interleaved", replace(ANT_WALKER, fall_rule="either"), PAPER, WALKER_STEPS, Interleaved()),
+    Experiment(
+        "walker/interleaved",
+        replace(ANT_WALKER, fall_rule="either"),
+        _annealed(WALKER_STEPS),
+        WALKER_STEPS,
+        Interleaved(),
+    ),
     Experiment("walker/symmetric", ANT_WALKER, PAPER, SYMMETRIC_STEPS, symmetric=True),
     Experiment(
         "walker/symmetric-interleaved",
         replace(ANT_WALKER, fall_rule="either"),
-        PAPER,
+        _annealed(SYMMETRIC_STEPS),
         SYMMETRIC_STEPS,
         Interleaved(),
         symmetric=True,

@@ -66,7 +66,7 @@ def describe():
             versions = ", ".join(f"{name} {meta['versions'][name]}" for name in ("footwork", "jax", "mujoco"))
             steps = meta["steps"]
             command = f"footwork train {row} --seeds {' '.join(map(str, meta['batch']))}"
-            if steps < EXPERIMENTS[row].total_steps:
+            if meta["experiment"]["total_steps"] != EXPERIMENTS[row].total_steps:
                 command += f" --total-steps {json.dumps(meta['experiment']['total_steps'])}"
             lines.append(f"| {row} | `{command}` | {steps:,} | {versions} |")
     return "\n".join(lines) + "\n"

@@ -31,6 +31,7 @@ class Glider:
     """An engine without mechanics: actions 0 and 1 are a velocity, actions 2 and 3 flip and lay down the ant."""
 
     traceable = False
+    resumable = True
     control_dt = DT
     seen: list[np.ndarray]  # every action, of the newest engine
 
@@ -68,10 +69,13 @@ class Glider:
     def restore(self, arrays):
         pass
 
+    def close(self):
+        pass
+
 
 @pytest.fixture
 def glider(monkeypatch):
-    monkeypatch.setattr(evaluating, "BatchPhysics", Glider)
+    monkeypatch.setattr(evaluating, "physics_for", lambda engine, *rest: Glider(*rest))
     return Glider
 
 
@@ -160,6 +164,7 @@ def test_transitions_are_means_over_seeds(glider, monkeypatch):
     assert report["switching"]["25"]["speed_mps"] == pytest.approx(1.05, abs=1e-3)
     assert report["switching"]["25"]["idle"] == 0.5
     assert [seed["idle"] for seed in report["switching_by_seed"]["25"]] == [0.0, 1.0]
+    assert (report["engine"], report["orthogonal"]) == ("mujoco", False)
     assert len(lines) == 4
     flat = replace(experiment, name="bandit/test", task=ANT_BANDIT)
     with pytest.raises(ValueError, match="transitions are measured on sub-policies"):

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from footwork.arena import MAZES, inside_walls, open_field
+from footwork.physics import physics_for
 from footwork.physics.batch import BatchPhysics
 from footwork.physics.mjcf import build_model
 from footwork.robot import JOINT_NAMES, ROBOTS
+from footwork.study.experiments import find_row
+from footwork.study.runs import train_row
 from footwork.types import PhysicsState
 
 HEAVY = ROBOTS["heavy"]
@@ -254,6 +257,18 @@ def test_a_diverged_row_is_reported_until_it_is_reset(logless, how):
     state = drive(physics, state, 10)[-1]
     assert not state.diverged.any()
     assert np.isfinite(state.qpos).all()
+
+
+def test_engines_are_known_by_name_and_a_missing_one_names_its_extra(tmp_path, monkeypatch):
+    assert isinstance(physics_for("mujoco", HEAVY, open_field(), 1), BatchPhysics)
+    with pytest.raises(ValueError, match="unknown engine 'ode'; known engines: mujoco, bullet, bullet-original"):
+        physics_for("ode", HEAVY, open_field(), 1)
+    monkeypatch.setattr("footwork.physics.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"^engine bullet needs an extra: pip install 'footwork\[bullet\]'$"):
+        physics_for("bullet", HEAVY, open_field(), 1)
+    with pytest.raises(ImportError, match="extra"):
+        train_row(find_row("bullet/walker/plain"), (0,), tmp_path)
+    assert not list(tmp_path.iterdir())  # a refusal leaves nothing behind
 
 
 def test_bad_sizes_are_refused():

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,17 @@ import pytest
 from footwork import checkpoint
 from footwork import train as training
 from footwork.record import RunDir, RunError, config_to_json, read_metrics
-from footwork.study.experiments import EXPERIMENTS, find_row
-from footwork.study.runs import find_trained, run_path, train_row
+from footwork.robot import ROBOTS
+from footwork.study.experiments import EXPERIMENTS, find_row, with_engine, with_robot
+from footwork.study.runs import (
+    PACKAGED,
+    find_trained,
+    finished_runs,
+    load_policies,
+    path_of_new_run,
+    run_path,
+    train_row,
+)
 from footwork.train import Interrupted, Trained, begin_learning, build_environment, iterate, steps_per_iteration
 
 
@@ -120,10 +130,12 @@ def test_rows_say_how_many_steps_they_take():
 def test_an_interrupted_run_goes_on_as_if_it_had_not_been(tmp_path, monkeypatch):
     """Of a master, with the sub-policies that it stands on."""
     row, needs = "bandit/hrl/plain", "walker/plain"
+    walker = untrained(needs)
+    monkeypatch.setitem(EXPERIMENTS, row, tiny(row, 4))
+    monkeypatch.setitem(EXPERIMENTS, needs, walker.experiment)
     for place in ("whole", "parts"):
         path = run_path(tmp_path / place, needs, (0,))
-        run = RunDir.create(path, {})
-        walker = untrained(needs)
+        run = RunDir.create(path, {"experiment": config_to_json(walker.experiment)})
         run.save_policy(walker.params, training.policy_meta(walker.experiment, (0,), 0))
         run.finish({"steps": 0})
     train_row(tiny(row, 4), (0,), tmp_path / "whole", num_threads=1)
@@ -167,8 +179,9 @@ with run.lock():
 """
 
 
-def test_a_run_in_use_is_left_alone(tmp_path):
+def test_a_run_in_use_is_left_alone(tmp_path, monkeypatch):
     experiment = tiny("walker/symmetric")
+    monkeypatch.setitem(EXPERIMENTS, experiment.name, experiment)
     config = {"experiment": config_to_json(experiment), "seeds": [0]}
     run = RunDir.create(run_path(tmp_path, experiment.name, (0,)), config)
     process = subprocess.Popen([sys.executable, "-c", HOLD, str(run.path)], stdout=subprocess.PIPE)
@@ -183,6 +196,78 @@ def test_a_run_in_use_is_left_alone(tmp_path):
         process.wait()
     with run.lock():  # a killed process lets go
         pass
+
+
+def finished(runs, experiment, name):
+    """A finished run that holds policies which learned nothing, newer than the ones before it."""
+    run = RunDir.create(runs / experiment.name / name, {"experiment": config_to_json(experiment), "seeds": [0]})
+    params = jax.vmap(jax.vmap(experiment.policy().init))(
+        jax.random.split(jax.random.key(0), (1, experiment.runs_per_seed))
+    )
+    run.save_policy(params, training.policy_meta(experiment, (0,), 0))
+    run.finish({"steps": 0})
+    return str(run.path)
+
+
+def test_only_a_run_with_the_rows_own_fields_is_what_its_address_means(tmp_path):
+    row = EXPERIMENTS["walker/plain"]
+    longer = finished(tmp_path, replace(row, total_steps=9_000_000), "longer")
+    others = {
+        "robot": with_robot(row, ROBOTS["stiff"]),
+        "learner": replace(row, ppo=replace(row.ppo, gamma=0.9)),
+        "task": replace(row, task=replace(row.task, episode_steps=7)),
+        "engine": replace(row, engine="bullet"),
+    }
+    for name, experiment in others.items():
+        path = finished(tmp_path, experiment, name)
+        assert find_trained(path, tmp_path).experiment == experiment  # by the path of its folder
+    assert [run.path.name for run in finished_runs("walker/plain", tmp_path)] == ["longer"]
+    assert find_trained("walker/plain", tmp_path).source.startswith(longer)
+    assert find_trained("walker/plain", tmp_path / "nothing").source == PACKAGED
+
+
+def test_a_run_with_other_fields_lies_in_a_place_of_its_own(tmp_path):
+    row = EXPERIMENTS["walker/plain"]
+    short = replace(row, total_steps=5000)
+    own = run_path(tmp_path, row.name, (0,))
+    assert path_of_new_run(tmp_path, row, (0,)) == path_of_new_run(tmp_path, short, (0,)) == own
+    stiff = with_robot(row, ROBOTS["stiff"])
+    places = [path_of_new_run(tmp_path, e, (0,)) for e in (stiff, with_robot(short, ROBOTS["light"]))]
+    assert len({own, *places}) == 3
+    assert {place.parent for place in places} == {own.parent}
+    assert path_of_new_run(tmp_path, replace(stiff, total_steps=5000), (0,)) == places[0]
+
+
+def test_an_engine_makes_a_row_of_its_own(tmp_path):
+    master = find_row("bullet/maze/hrl/appropriate-bias")
+    assert (master.name, master.engine) == ("bullet/maze/hrl/appropriate-bias", "bullet")
+    assert master.needs == "bullet/walker/appropriate-bias"
+    assert find_row(master.needs).needs == "bullet/walker/plain"
+    assert with_engine(master, "mujoco") == find_row("mujoco/maze/hrl/appropriate-bias") == EXPERIMENTS[master.name[7:]]
+    assert path_of_new_run(tmp_path, master, (0,)) == tmp_path / "bullet/maze/hrl/appropriate-bias/seed-0"
+    with pytest.raises(ValueError, match="unknown engine 'ode'; known engines: mujoco, bullet"):
+        replace(master, engine="ode")
+    with pytest.raises(RunError, match="no finished run of bullet/walker/plain in"):
+        find_trained("bullet/walker/plain", tmp_path)
+
+
+def test_a_master_on_another_ant_stands_on_policies_of_that_ant(tmp_path):
+    row = with_robot(tiny("bandit/hrl/plain"), ROBOTS["stiff"])
+    walker = with_robot(EXPERIMENTS["walker/plain"], ROBOTS["stiff"])
+    path = finished(tmp_path, walker, "mine")
+    finished(tmp_path, EXPERIMENTS["walker/plain"], "newer")
+    trained = train_row(row, (0,), tmp_path, num_threads=1)
+    kept = load_policies(Path(trained.source).parent / "needed.safetensors")
+    assert kept.experiment == walker
+    by_path = replace(row, sub_policies=path)
+    assert train_row(by_path, (0,), tmp_path, num_threads=1).source != trained.source
+
+
+def test_an_unfinished_run_is_no_address(tmp_path):
+    experiment = tiny("walker/plain")
+    run = RunDir.create(tmp_path / "begun", {"experiment": config_to_json(experiment), "seeds": [0]})
+    with pytest.raises(RunError, match="holds an unfinished run"):
+        find_trained(str(run.path), tmp_path)
 
 
 def test_unknown_and_untrained_rows_are_named(tmp_path):

@@ -105,13 +105,17 @@ class Env:
 
     def simulate(self, state: EnvState, key: Key) -> EnvState:
         """One control step of the rows that are not held."""
-        physics = self.physics.reset(state.physics, state.stale, state.physics.qpos, state.physics.qvel)
+        before = state.physics
+        physics = self.physics.reset(before, state.stale, before.qpos, before.qvel)
+        if physics is not before:  # progress counts from where the engine sees a fresh ant
+            xp = jnp if self.physics.traceable else np
+            before = before._replace(qpos=xp.where(xp.asarray(state.stale)[:, None], physics.qpos, before.qpos))
         if self.physics.traceable:
             moved = self.physics.step(physics, state.action, ~state.held)
         else:
             held = np.asarray(state.held)
             moved = self.physics.step(physics, state.action, ~held if held.any() else None)
-        return state._replace(physics=moved, previous=state.physics, stale=jnp.zeros_like(state.stale))
+        return state._replace(physics=moved, previous=before, stale=jnp.zeros_like(state.stale))
 
     def finish(self, state: EnvState, key: Key) -> tuple[EnvState, TimeStep]:
         """Reward and end of the step; a held row earns nothing and ends nothing."""

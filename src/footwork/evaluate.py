@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,7 +17,7 @@ from footwork.arena import DIRECTIONS, open_field
 from footwork.env import Env, Environment, split_phases
 from footwork.learn.networks import Policy
 from footwork.options import Options, OptionsState, SubPolicies
-from footwork.physics.batch import BatchPhysics
+from footwork.physics import DEFAULT_ENGINE, physics_for
 from footwork.regularisers import directions_of_rows
 from footwork.tasks.task import SUCCESS_RADII, Task
 from footwork.train import Experiment, Trained
@@ -60,7 +61,7 @@ def evaluation_environment(
     task = experiment.task
     if task.goal_radius is not None:
         task = replace(task, goal_radius=min(*SUCCESS_RADII, task.goal_radius))
-    physics = BatchPhysics(task.robot, task.arena, num_envs, num_threads)
+    physics = physics_for(experiment.engine, task.robot, task.arena, num_envs, num_threads)
     if experiment.is_walker:
         return Env(task, physics, directions_of_rows(num_envs, range(_NUM_DIRECTIONS)))
     env = Env(task, physics)
@@ -86,19 +87,20 @@ def play_episodes(
     state, obs = env.initial(jax.random.fold_in(key, 0))
     goal_radius, dt = experiment.task.goal_radius or 0.0, stride * experiment.task.robot.control_dt
     steps, paths, ended = [], [_positions(state)], []
-    for i in range(num_decisions):
-        ended.append(np.asarray(_inner(state).held))
-        if ended[-1].all():
-            ended.pop()
-            break
-        state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
-        state = env.simulate(state, simulate_key)
-        state, step = _finish(env, state, finish_key)
-        obs = step.obs
-        keep = (step.events, step.terms["progress"], action if experiment.is_master else ())
-        steps.append(jax.tree.map(np.asarray, keep))
-        if i % max(1, 10 // stride) == 0 or experiment.is_master:
-            paths.append(_positions(state))
+    with closing(env.physics):
+        for i in range(num_decisions):
+            ended.append(np.asarray(_inner(state).held))
+            if ended[-1].all():
+                ended.pop()
+                break
+            state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
+            state = env.simulate(state, simulate_key)
+            state, step = _finish(env, state, finish_key)
+            obs = step.obs
+            keep = (step.events, step.terms["progress"], action if experiment.is_master else ())
+            steps.append(jax.tree.map(np.asarray, keep))
+            if i % max(1, 10 // stride) == 0 or experiment.is_master:
+                paths.append(_positions(state))
     events, progress, choices = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
     over = np.stack(ended)
     counts = lambda name: (events[name] & ~over).any(axis=0)  # noqa: E731
@@ -184,6 +186,7 @@ def evaluate(
     success = None if experiment.is_walker else {str(radius): closest <= radius for radius in SUCCESS_RADII}
     report: dict[str, Any] = {
         "row": experiment.name,
+        "engine": experiment.engine,
         "seeds": list(trained.seeds),
         "episodes": int(closest.size),
         "success": None if success is None else {radius: float(hit.mean()) for radius, hit in success.items()},
@@ -243,6 +246,12 @@ class _Walk:
     env: Options
     key: Key
 
+    def __enter__(self) -> _Walk:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.env.physics.close()
+
     def start(self) -> OptionsState:
         state, _ = self.env.initial(jax.random.fold_in(self.key, 0))
         return state
@@ -255,14 +264,21 @@ class _Walk:
         return state, step.events
 
 
-def _walk(sub_policies: SubPolicies, task: Task, num_envs: int, seed: int, num_threads: int) -> _Walk:
+def _walk(
+    sub_policies: SubPolicies, task: Task, num_envs: int, seed: int, num_threads: int, engine: str = DEFAULT_ENGINE
+) -> _Walk:
     task = switching_task(task)
-    env = Env(task, BatchPhysics(task.robot, task.arena, num_envs, num_threads), (0,) * num_envs)
+    env = Env(task, physics_for(engine, task.robot, task.arena, num_envs, num_threads), (0,) * num_envs)
     return _Walk(Options(env, sub_policies, _SEGMENT), jax.random.key(seed))
 
 
 def handover_matrix(
-    sub_policies: SubPolicies, task: Task, ants: int = 64, seed: int = 0, num_threads: int = 0
+    sub_policies: SubPolicies,
+    task: Task,
+    ants: int = 64,
+    seed: int = 0,
+    num_threads: int = 0,
+    engine: str = DEFAULT_ENGINE,
 ) -> list[list[dict[str, float]]]:
     """Run i for 100 to 200 control steps, then j for 300: entry [i][j] has fall and flip rate and the speed after.
 
@@ -272,18 +288,18 @@ def handover_matrix(
     first, second = pairs // _NUM_DIRECTIONS, pairs % _NUM_DIRECTIONS
     low, high = (steps // _SEGMENT for steps in HANDOVER_AFTER)
     switch = np.random.default_rng(seed).integers(low, high + 1, first.size)
-    walk = _walk(sub_policies, task, first.size, seed, num_threads)
-    state, after = walk.start(), HANDOVER_STEPS // _SEGMENT
     fell, flipped = np.zeros_like(first, bool), np.zeros_like(first, bool)
     at_switch, at_end = np.zeros((first.size, 2)), np.zeros((first.size, 2))
-    for segment in range(high + after):
-        position = _positions(state)
-        at_switch = np.where(np.equal(segment, switch)[:, None], position, at_switch)
-        state, events = walk.run(state, np.where(segment < switch, first, second), segment)
-        counted = (segment >= switch) & (segment < switch + after)
-        fell = fell | (np.asarray(events["fallen"]) & counted)
-        flipped = flipped | (np.asarray(events["flipped"]) & counted)
-        at_end = np.where(np.equal(segment, switch + after - 1)[:, None], _positions(state), at_end)
+    with _walk(sub_policies, task, first.size, seed, num_threads, engine) as walk:
+        state, after = walk.start(), HANDOVER_STEPS // _SEGMENT
+        for segment in range(high + after):
+            position = _positions(state)
+            at_switch = np.where(np.equal(segment, switch)[:, None], position, at_switch)
+            state, events = walk.run(state, np.where(segment < switch, first, second), segment)
+            counted = (segment >= switch) & (segment < switch + after)
+            fell = fell | (np.asarray(events["fallen"]) & counted)
+            flipped = flipped | (np.asarray(events["flipped"]) & counted)
+            at_end = np.where(np.equal(segment, switch + after - 1)[:, None], _positions(state), at_end)
     seconds = HANDOVER_STEPS * task.robot.control_dt
     speed = np.sum((at_end - at_switch) * _UNIT[second], axis=1) / seconds
     by_pair = [array.reshape(_NUM_DIRECTIONS, _NUM_DIRECTIONS, ants).mean(axis=2) for array in (fell, flipped, speed)]
@@ -304,6 +320,7 @@ def random_switching(
     seed: int = 0,
     orthogonal: bool = False,
     num_threads: int = 0,
+    engine: str = DEFAULT_ENGINE,
 ) -> dict[str, float]:
     """2000 control steps in which every ant draws a new direction every ``option_steps``.
 
@@ -314,18 +331,19 @@ def random_switching(
     if option_steps % _SEGMENT:
         raise ValueError(f"option_steps must be a multiple of {_SEGMENT}, got {option_steps}")
     generator = np.random.default_rng(seed)
-    walk = _walk(sub_policies, task, ants, seed, num_threads)
-    state, choice = walk.start(), generator.integers(0, _NUM_DIRECTIONS, ants)
+    choice = generator.integers(0, _NUM_DIRECTIONS, ants)
     per_option, speeds = option_steps // _SEGMENT, []
-    for option in range(SWITCHING_STEPS // option_steps):
-        if option:
-            turn = generator.choice((1, 3), ants) if orthogonal else generator.integers(0, _NUM_DIRECTIONS, ants)
-            choice = (choice + turn) % _NUM_DIRECTIONS
-        before = _positions(state)
-        for segment in range(per_option):
-            state, _ = walk.run(state, choice.astype(np.int32), option * per_option + segment)
-        moved = np.sum((_positions(state) - before) * _UNIT[choice], axis=1)
-        speeds.append(moved / (option_steps * task.robot.control_dt))
+    with _walk(sub_policies, task, ants, seed, num_threads, engine) as walk:
+        state = walk.start()
+        for option in range(SWITCHING_STEPS // option_steps):
+            if option:
+                turn = generator.choice((1, 3), ants) if orthogonal else generator.integers(0, _NUM_DIRECTIONS, ants)
+                choice = (choice + turn) % _NUM_DIRECTIONS
+            before = _positions(state)
+            for segment in range(per_option):
+                state, _ = walk.run(state, choice.astype(np.int32), option * per_option + segment)
+            moved = np.sum((_positions(state) - before) * _UNIT[choice], axis=1)
+            speeds.append(moved / (option_steps * task.robot.control_dt))
     after_first = np.stack(speeds[1:])
     qpos = np.asarray(state.inner.physics.qpos)
     return {
@@ -347,14 +365,17 @@ def transitions(
     deterministic: bool = False,
     num_threads: int = 0,
     periods: tuple[int, ...] = SWITCHING_PERIODS,
+    orthogonal: bool = False,
     report: Report = lambda line: None,
 ) -> dict[str, Any]:
     """The hand-over matrix and random switching of a row's sub-policies, as means over its seeds.
 
+    With ``orthogonal``, every new direction of the switching is at right angles to the last.
+
     Raises:
         ValueError: the row trains no sub-policies.
     """
-    task = trained.experiment.task
+    task, engine = trained.experiment.task, trained.experiment.engine
     if not trained.experiment.is_walker:
         raise ValueError(f"transitions are measured on sub-policies (walker/...), not on {trained.experiment.name}")
     matrices: list[list[list[dict[str, float]]]] = []
@@ -362,14 +383,17 @@ def transitions(
     for index in range(len(trained.seeds)):
         subs = trained.sub_policies(index, deterministic)
         report(f"seed {trained.seeds[index]}: hand-over matrix")
-        matrices.append(handover_matrix(subs, task, max(1, ants // 4), seed + index, num_threads))
+        matrices.append(handover_matrix(subs, task, max(1, ants // 4), seed + index, num_threads, engine))
         for k in periods:
             report(f"seed {trained.seeds[index]}: random switching, k = {k}")
-            switching[str(k)].append(random_switching(subs, task, k, ants, seed + index, num_threads=num_threads))
+            figures = random_switching(subs, task, k, ants, seed + index, orthogonal, num_threads, engine)
+            switching[str(k)].append(figures)
     mean = lambda *values: float(np.mean(values))  # noqa: E731
     return {
         "row": trained.experiment.name,
+        "engine": engine,
         "seeds": list(trained.seeds),
+        "orthogonal": orthogonal,
         "handover": jax.tree.map(mean, *matrices),
         "switching": {k: jax.tree.map(mean, *results) for k, results in switching.items()},
         "switching_by_seed": switching,

@@ -7,7 +7,7 @@ import signal
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from footwork.learn import ppo
 from footwork.learn.config import PPOConfig
 from footwork.learn.networks import Policy, categorical_policy, gaussian_policy
 from footwork.options import Options, SubPolicies
-from footwork.physics.batch import BatchPhysics
+from footwork.physics import DEFAULT_ENGINE, check_engine, physics_for
 from footwork.record import Progress, RunDir, config_to_json, versions
 from footwork.regularisers import (
     AppropriateBias,
@@ -55,6 +55,7 @@ class Experiment:
         sub_policies: of master rows: the walker row that the master chooses among.
         option_steps: the paper's k, of master rows. Not stated in the paper.
         deterministic_sub_policies: they act by their mode under a master. Not in the paper.
+        engine: the physics it is trained on, one of ``footwork.physics.ENGINES``.
     """
 
     name: str
@@ -66,8 +67,10 @@ class Experiment:
     sub_policies: str | None = None
     option_steps: int = 50
     deterministic_sub_policies: bool = False
+    engine: str = DEFAULT_ENGINE
 
     def __post_init__(self) -> None:
+        check_engine(self.engine)
         if self.total_steps < 1:
             raise ValueError(f"total_steps must be >= 1, got {self.total_steps}")
         if self.option_steps < 1:
@@ -144,7 +147,7 @@ def build_environment(
     """The training environment of a row: task, regulariser or options, automatic reset."""
     num_envs = experiment.ppo.num_envs * num_seeds * experiment.runs_per_seed
     task = experiment.task
-    physics = BatchPhysics(task.robot, task.arena, num_envs, num_threads)
+    physics = physics_for(experiment.engine, task.robot, task.arena, num_envs, num_threads)
     if experiment.needs is not None and needed is None:
         raise ValueError(f"{experiment.name} needs the policies of {experiment.needs}")
     if not experiment.is_walker:
@@ -225,7 +228,8 @@ def train(
     Raises:
         TrainingDiverged: a metric of the learner is not finite; names it, the step and the last checkpoint.
         Interrupted: SIGINT or SIGTERM came; the state is saved.
-        ValueError: the run is beyond ``experiment.total_steps`` already.
+        ValueError: the run is beyond ``experiment.total_steps`` already, or has a checkpoint that its engine
+            cannot go on from.
     """
     env = build_environment(experiment, len(seeds), needed, num_threads)
     learning = _resume(run, env, begin_learning(experiment, env, seeds))
@@ -237,6 +241,7 @@ def train(
         raise ValueError(f"{run.path} is at step {at} already: total_steps must be at least that, got {total}")
     last_save = time.monotonic()
     with (
+        closing(env.physics),
         run.open_metrics(tensorboard) as log,
         Progress(total, experiment.name, initial_step=learning.iteration * per_iteration) as progress,
         _stop_signals() as stop_asked,
@@ -254,7 +259,10 @@ def train(
                 _save(run, env, learning, step)
                 last_save = time.monotonic()
             if stop_asked():
-                raise Interrupted(f"stopped at step {step} of {total}; saved in {run.path}, go on with --resume")
+                how = (
+                    "go on with --resume" if env.physics.resumable else f"but engine {experiment.engine} cannot resume"
+                )
+                raise Interrupted(f"stopped at step {step} of {total}; saved in {run.path}, {how}")
     _save(run, env, learning, total)
     return _finish(experiment, seeds, run, learning, total)
 
@@ -296,8 +304,8 @@ def _resume(run: RunDir, env: Environment, fresh: Learning) -> Learning:
     tree, meta = checkpoint.load(latest.path, _tree(env, fresh))
     for damage in latest.skipped:
         warnings.warn(f"going on from step {latest.step}: {damage}", stacklevel=2)
-    run.rewind(latest.step)
     env.physics.restore(tree["engine"])
+    run.rewind(latest.step)
     return Learning(int(meta["iteration"]), tree["learners"], tree["carry"])
 
 

@@ -52,6 +52,7 @@ class Physics(Protocol):
     """A physics engine stepping N ants at once."""
 
     traceable: bool  # may be called inside jit (MJX), or only from the host (C engines)
+    resumable: bool  # snapshot() holds all there is: a run can go on bit for bit
     control_dt: float  # seconds per control step
     num_envs: int
 
@@ -65,7 +66,10 @@ class Physics(Protocol):
         qpos: Any,  # Float[Array, "N 15"]
         qvel: Any,  # Float[Array, "N 14"]
     ) -> PhysicsState:
-        """Put the rows in ``mask`` at ``qpos``, ``qvel``; the others stay as they are."""
+        """Put the rows in ``mask`` at ``qpos``, ``qvel``; the others stay as they are.
+
+        The ``qpos`` that comes back is the engine's own view of that pose, from which progress counts.
+        """
 
     def step(self, state: PhysicsState, action: Any, active: Any | None = None) -> PhysicsState:
         """Advance one control step; rows outside ``active`` are held and cost nothing."""
@@ -74,7 +78,14 @@ class Physics(Protocol):
         """The engine's whole hidden state as named arrays (empty where all of it is in PhysicsState)."""
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        """Continue, bit for bit, from what :meth:`snapshot` returned."""
+        """Continue, bit for bit, from what :meth:`snapshot` returned.
+
+        Raises:
+            ValueError: the engine is not ``resumable``; one line that says why.
+        """
+
+    def close(self) -> None:
+        """Give back at once what Python's garbage collector would not (processes)."""
 
 
 class TimeStep(NamedTuple):

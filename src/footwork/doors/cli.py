@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from footwork.train import Experiment
+    from footwork.train import Experiment, Trained
 
 RowName = Annotated[str, tyro.conf.Positional]
 
@@ -38,6 +38,7 @@ class Train:
 
     row: RowName  # its address, as `footwork list` shows it
     seeds: tuple[int, ...] = (0,)  # trained side by side in one batch
+    engine: str | None = None  # the physics: mujoco, bullet or bullet-original; ROW then means ENGINE/ROW
     robot: str | None = None  # another ant: heavy, bullet, stiff or light
     maze: str | None = None  # another maze: a name, or a text file of rows of # . r g
     runs: Path = Path("runs")  # where runs are kept
@@ -52,8 +53,9 @@ class Train:
 class Evaluate:
     """Play episodes with a trained row: success at four radii, falls, flips, progress, time to goal."""
 
-    row: RowName  # its address, as `footwork list` shows it
+    row: RowName  # its address, as `footwork list` shows it, or the folder of a run
     runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
+    engine: str | None = None  # play on another physics than it was trained on: mujoco, bullet or bullet-original
     episodes: int = 1000  # per seed
     seed: int = 1_000_003  # of the episodes
     deterministic: bool = False  # act by the mode of the distribution instead of a sample
@@ -65,8 +67,10 @@ class Evaluate:
 class Transitions:
     """Test hand-overs between sub-policies: the 4 x 4 matrix, and random switching."""
 
-    row: RowName  # a walker row
+    row: RowName  # a walker row, or the folder of a run of one
     runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
+    engine: str | None = None  # play on another physics than it was trained on: mujoco, bullet or bullet-original
+    orthogonal: bool = False  # switch at right angles only
     ants: int = 256  # per period of switching, and a quarter of it per pair of the matrix
     seed: int = 1_000_003  # of the episodes
     deterministic: bool = False  # act by the mode of the distribution instead of a sample
@@ -126,16 +130,15 @@ def _is_for_the_user(error: Exception) -> bool:
 
 def _list(command: List, rest: list[str]) -> int:
     from footwork.doors import tables
-    from footwork.study.experiments import EXPERIMENTS
+    from footwork.physics import ENGINES
+    from footwork.study.experiments import EXPERIMENTS, find_row
     from footwork.study.runs import finished_runs, packaged
 
-    found = {
-        name: f"{len(finished_runs(name, command.runs))} runs"
-        if finished_runs(name, command.runs)
-        else ("packaged" if packaged(name).is_file() else "")
-        for name in EXPERIMENTS
-    }
-    tables.show(tables.rows_table(list(EXPERIMENTS.values()), found))
+    elsewhere = [f"{engine}/{name}" for engine in ENGINES for name in EXPERIMENTS if (command.runs / engine).is_dir()]
+    runs = {name: len(finished_runs(name, command.runs)) for name in (*EXPERIMENTS, *elsewhere)}
+    rows = [find_row(name) for name in runs if name in EXPERIMENTS or runs[name]]
+    found = {row: f"{n} runs" if n else "packaged" if packaged(row).is_file() else "" for row, n in runs.items()}
+    tables.show(tables.rows_table(rows, found))
     return 0
 
 
@@ -166,9 +169,11 @@ def _customised(command: Train, rest: list[str]) -> Experiment:
     from dataclasses import replace
 
     from footwork.robot import ROBOTS
-    from footwork.study.experiments import find_row, read_maze, with_robot
+    from footwork.study.experiments import find_row, read_maze, with_engine, with_robot
 
     experiment = find_row(command.row)
+    if command.engine is not None:
+        experiment = with_engine(experiment, command.engine)
     if command.robot is not None:
         if command.robot not in ROBOTS:
             raise ValueError(f"unknown robot {command.robot!r}; known robots: {', '.join(ROBOTS)}")
@@ -188,6 +193,7 @@ def _evaluate(command: Evaluate, rest: list[str]) -> int:
 
     trained = find_trained(command.row, command.runs)
     needed = find_needed(trained, command.runs)
+    trained = _played_on(trained, command.engine)
     _at_least_one("episodes", command.episodes)
     report = evaluate(trained, needed, command.episodes, command.seed, command.deterministic, command.threads)
     if command.json:
@@ -202,7 +208,7 @@ def _transitions(command: Transitions, rest: list[str]) -> int:
     from footwork.evaluate import transitions
     from footwork.study.runs import find_trained
 
-    trained = find_trained(command.row, command.runs)
+    trained = _played_on(find_trained(command.row, command.runs), command.engine)
     _at_least_one("ants", command.ants)
     report = transitions(
         trained,
@@ -210,6 +216,7 @@ def _transitions(command: Transitions, rest: list[str]) -> int:
         command.seed,
         command.deterministic,
         command.threads,
+        orthogonal=command.orthogonal,
         report=lambda line: print(line, file=sys.stderr),
     )
     if command.json:
@@ -224,6 +231,17 @@ def _quickstart(command: Quickstart, rest: list[str]) -> int:
 
     quickstart(command.to, command.seed, command.steps, command.threads)
     return 0
+
+
+def _played_on(trained: Trained, engine: str | None) -> Trained:
+    """The same policies on another physics."""
+    from dataclasses import replace
+
+    from footwork.physics import require_engine
+
+    experiment = trained.experiment if engine is None else replace(trained.experiment, engine=engine)
+    require_engine(experiment.engine)
+    return trained._replace(experiment=experiment)
 
 
 def _at_least_one(name: str, value: int) -> None:

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from footwork.arena import DIRECTIONS
+from footwork.physics import DEFAULT_ENGINE, ENGINES
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment
 
@@ -59,7 +60,7 @@ def evaluation_table(reports: list[dict[str, Any]]) -> Table:
         else:
             cells = [_rate(report["success"][r], interval["success"][r]) for r in report["success"]]
         table.add_row(
-            report["row"],
+            _played(report),
             str(report["episodes"]),
             *cells,
             _rate(report["fall_rate"], interval["fall_rate"]),
@@ -72,7 +73,7 @@ def evaluation_table(reports: list[dict[str, Any]]) -> Table:
 
 def handover_table(report: dict[str, Any]) -> Table:
     """Who hands over to whom: speed after, falls, flips."""
-    table = Table(title=f"{report['row']}: hand-over, m/s after (fall %, flip %)", title_justify="left")
+    table = Table(title=f"{_played(report)}: hand-over, m/s after (fall %, flip %)", title_justify="left")
     table.add_column("from \\ to")
     for name in DIRECTIONS:
         table.add_column(name, justify="right")
@@ -84,14 +85,22 @@ def handover_table(report: dict[str, Any]) -> Table:
 
 def switching_table(reports: list[dict[str, Any]]) -> Table:
     """Random switching, one line per row and period."""
-    table = Table(title="random switching for 2000 control steps", title_justify="left")
+    how = " between orthogonal directions" if any(report["orthogonal"] for report in reports) else ""
+    table = Table(title=f"random switching{how} for 2000 control steps", title_justify="left")
     for column in ("row", "k", "m/s per option", "idle %", "upside down %", "fallen %"):
         table.add_column(column, justify="left" if column == "row" else "right", no_wrap=True)
     for report in reports:
         for k, figures in report["switching"].items():
             shares = (f"{100 * figures[name]:.1f}" for name in ("idle", "upside_down", "fallen"))
-            table.add_row(report["row"], k, f"{figures['speed_mps']:.2f}", *shares)
+            table.add_row(_played(report), k, f"{figures['speed_mps']:.2f}", *shares)
     return table
+
+
+def _played(report: dict[str, Any]) -> str:
+    """The row, and the engine it was played on where that is another than its own."""
+    row, engine = report["row"], report["engine"]
+    own = row.partition("/")[0] if row.partition("/")[0] in ENGINES else DEFAULT_ENGINE
+    return row if engine == own else f"{row} on {engine}"
 
 
 def _rate(rate: float, interval: list[float]) -> str:

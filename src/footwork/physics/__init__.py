@@ -1,1 +1,74 @@
-"""The engines that step the ant, behind one protocol (:class:`footwork.types.Physics`)."""
+"""The engines that step the ant, behind one protocol (:class:`footwork.types.Physics`).
+
+An engine is a module here and a line in :data:`ENGINES`. Nothing of it is imported before it is asked for.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import NamedTuple
+
+from footwork.arena import Arena
+from footwork.robot import Robot
+from footwork.types import Physics
+
+DEFAULT_ENGINE = "mujoco"
+
+
+class Engine(NamedTuple):
+    """Where an engine is: ``factory(robot, arena, num_envs, num_threads)`` makes its Physics."""
+
+    module: str
+    factory: str
+    library: str = ""  # that comes with the extra of the same name as the module
+    about: str = ""
+
+
+ENGINES: dict[str, Engine] = {
+    "mujoco": Engine("batch", "BatchPhysics", about="MuJoCo in C on a thread pool"),
+    "bullet": Engine("bullet", "BulletPhysics", "pybullet", "PyBullet, the paper's engine"),
+    "bullet-original": Engine("bullet", "OriginalEnvPhysics", "pybullet", "the same, seen as AntBulletEnv-v0 sees it"),
+}
+
+
+def check_engine(name: str) -> None:
+    """Refuse an engine that does not exist.
+
+    Raises:
+        ValueError: lists those that do.
+    """
+    if name not in ENGINES:
+        raise ValueError(f"unknown engine {name!r}; known engines: {', '.join(ENGINES)}")
+
+
+def require_engine(name: str) -> None:
+    """Refuse, before anything was begun, an engine that does not exist or is not installed.
+
+    Raises:
+        ValueError: there is no such engine.
+        ImportError: its library is missing; names the extra that brings it.
+    """
+    check_engine(name)
+    engine = ENGINES[name]
+    if engine.library and find_spec(engine.library) is None:
+        raise ImportError(f"engine {name} needs an extra: pip install 'footwork[{engine.module}]'")
+
+
+def physics_for(engine: str, robot: Robot, arena: Arena, num_envs: int, num_threads: int = 0) -> Physics:
+    """N ants on an engine.
+
+    Args:
+        engine: one of :data:`ENGINES`.
+        robot: the ant.
+        arena: whose walls stand around every ant.
+        num_envs: N.
+        num_threads: threads or worker processes; 0 means all cores. Changes no number.
+
+    Raises:
+        ValueError: there is no such engine, or it has no such ant.
+        ImportError: the engine's library is missing; names the extra that brings it.
+    """
+    require_engine(engine)
+    home = import_module(f"footwork.physics.{ENGINES[engine].module}")
+    return getattr(home, ENGINES[engine].factory)(robot, arena, num_envs, num_threads)

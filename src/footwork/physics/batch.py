@@ -46,6 +46,7 @@ class BatchPhysics:
     """
 
     traceable = False
+    resumable = True
 
     def __init__(self, robot: Robot, arena: Arena, num_envs: int, num_threads: int = 0):
         if num_envs < 1:
@@ -120,6 +121,9 @@ class BatchPhysics:
         self._touching[...] = arrays["touching"]
         self._batch.warning[...] = arrays["warning"]
         self._failed[...] = arrays["failed"]
+
+    def close(self) -> None:
+        """Nothing to do: all of it is memory."""
 
     def _forward(self, ids: np.ndarray) -> None:
         """Forget earlier failures and bring contacts up to date after a change of state; a bad state is seen here."""

@@ -2,6 +2,7 @@
 
 Rows are data. Training, evaluation, packaged weights and smoke tests are derived from
 :data:`EXPERIMENTS`; Table 1 of the paper stands once, in ``footwork.learn.config.PAPER``.
+Every row exists on every engine: ``bullet/walker/plain`` is ``walker/plain`` on PyBullet.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 
 from footwork.arena import MAZES, Arena, bandit, maze, open_field
 from footwork.learn.config import PAPER, PPOConfig
+from footwork.physics import DEFAULT_ENGINE, ENGINES, check_engine
 from footwork.regularisers import AppropriateBias, Interleaved, RandomRepeated, RandomStart
 from footwork.robot import HEAVY, Robot
 from footwork.tasks.task import Task
@@ -120,11 +122,14 @@ EXPERIMENTS: dict[str, Experiment] = {
 
 
 def find_row(name: str) -> Experiment:
-    """The row of that name.
+    """The row of that name; on another engine than the default where that engine's name comes first.
 
     Raises:
         ValueError: there is none; lists those there are.
     """
+    first, _, rest = name.partition("/")
+    if first in ENGINES and rest in EXPERIMENTS:
+        return with_engine(EXPERIMENTS[rest], first)
     if name not in EXPERIMENTS:
         raise ValueError(f"unknown row {name!r}; known rows: {', '.join(EXPERIMENTS)}")
     return EXPERIMENTS[name]
@@ -133,6 +138,27 @@ def find_row(name: str) -> Experiment:
 def with_robot(experiment: Experiment, robot: Robot) -> Experiment:
     """The row with another ant."""
     return replace(experiment, task=replace(experiment.task, robot=robot))
+
+
+def with_engine(row: Experiment, engine: str) -> Experiment:
+    """The row on another engine, with everything it stands on: a row of its own, addressed ``ENGINE/ROW``.
+
+    Raises:
+        ValueError: there is no such engine.
+    """
+    check_engine(engine)
+    regulariser = row.regulariser
+    if isinstance(regulariser, AppropriateBias):
+        regulariser = replace(regulariser, partners=_on_engine(regulariser.partners, engine))
+    needed = None if row.sub_policies is None else _on_engine(row.sub_policies, engine)
+    name = _on_engine(row.name, engine)
+    return replace(row, name=name, engine=engine, regulariser=regulariser, sub_policies=needed)
+
+
+def _on_engine(address: str, engine: str) -> str:
+    first, _, rest = address.partition("/")
+    bare = rest if first in ENGINES else address
+    return bare if engine == DEFAULT_ENGINE else f"{engine}/{bare}"
 
 
 def read_maze(name_or_file: str) -> Arena:

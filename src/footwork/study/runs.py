@@ -1,12 +1,20 @@
-"""Runs by row name: where they lie, how they are trained, and which trained policies a name means.
+"""Runs by address: where they lie, how they are trained, and which trained policies an address means.
 
 A run of ``maze/hrl/plain`` lies in ``RUNS/maze/hrl/plain/seed-0``. The policies it was
-trained on top of are kept beside its own, so that it means the same for ever. A row
-name means the newest finished run of that row under RUNS, else the packaged weights.
+trained on top of are kept beside its own, so that it means the same for ever.
+
+One rule says what an address means. A run counts as a row if its saved fields are those of
+the row, its length aside; a row's address means the newest finished run that does, else the
+packaged weights. A run with any other field (another robot, maze, learning rate) lies in a
+folder of its own, ``RUNS/ROW/custom-1a2b3c4d-seed-0`` or ``RUNS/ROW/NAME``, and its address is
+the path of that folder. Engines make rows of their own: ``bullet/maze/hrl/plain``.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -16,6 +24,7 @@ import jax
 
 from footwork import checkpoint
 from footwork.checkpoint import CheckpointError
+from footwork.physics import require_engine
 from footwork.record import RunDir, RunError, config_from_json, config_to_json, versions
 from footwork.study.experiments import find_row, with_robot
 from footwork.train import Experiment, Trained, planned_steps, policy_meta, train
@@ -31,6 +40,28 @@ def run_path(runs: Path, row: str, seeds: tuple[int, ...]) -> Path:
     return runs / row / (name + "-".join(map(str, seeds)))
 
 
+def path_of_new_run(runs: Path, experiment: Experiment, seeds: tuple[int, ...]) -> Path:
+    """Where a run lies that was given no name: the row's own place only if its fields are the row's."""
+    path = run_path(runs, experiment.name, seeds)
+    try:
+        row = find_row(experiment.name)
+    except ValueError:  # not in the table: the name is all its own
+        return path
+    if same_row(experiment, row):
+        return path
+    fields = json.dumps(config_to_json(_without_length(experiment)), sort_keys=True).encode()
+    return path.with_name(f"custom-{hashlib.blake2b(fields, digest_size=4).hexdigest()}-{path.name}")
+
+
+def same_row(one: Experiment, other: Experiment) -> bool:
+    """Whether two runs with these fields are runs of the same row: they may differ in length."""
+    return _without_length(one) == _without_length(other)
+
+
+def _without_length(experiment: Experiment) -> Experiment:
+    return replace(experiment, total_steps=1)
+
+
 def train_row(
     experiment: Experiment,
     seeds: tuple[int, ...],
@@ -42,16 +73,20 @@ def train_row(
 ) -> Trained:
     """Train a row into its run directory, and first what it needs where no trained policies are found.
 
+    The directory is ``runs`` / row / ``name``, or the one of :func:`path_of_new_run`.
+
     With ``resume``, goes on from the newest checkpoint, or returns a finished run as it
     is; a larger ``total_steps`` than it was finished with is trained on to.
 
     Raises:
-        ValueError: bad seeds, or the run was begun with another config.
+        ValueError: bad seeds, the run was begun with another config, or its engine cannot resume.
+        ImportError: its engine is not installed.
         RunError: the directory is in use, or occupied and not to be resumed.
         CheckpointError: a checkpoint is damaged, or the disk is full.
     """
     _check_seeds(seeds)
-    path = run_path(runs, experiment.name, seeds) if name is None else runs / experiment.name / name
+    require_engine(experiment.engine)
+    path = path_of_new_run(runs, experiment, seeds) if name is None else runs / experiment.name / name
     config = {"experiment": config_to_json(experiment), "seeds": list(seeds)}
     if resume and (path / "config.json").is_file():
         run = _reopen(path, config)
@@ -77,7 +112,7 @@ def _reopen(path: Path, config: dict[str, Any]) -> RunDir:
     """The run there, if it is the same but for its length."""
     run = RunDir.open_existing(path)
     old = run.config()
-    if _without_length(old) != _without_length(config):
+    if _without_steps(old) != _without_steps(config):
         raise ValueError(f"{path} was begun with another config: resume with that one, or choose another --name")
     then, now = run.versions(), versions()
     for name in ("jax", "mujoco"):  # with another, the numbers would not be those of an uninterrupted run
@@ -88,20 +123,26 @@ def _reopen(path: Path, config: dict[str, Any]) -> RunDir:
     return run
 
 
-def _without_length(config: dict[str, Any]) -> dict[str, Any]:
-    experiment = {k: v for k, v in config.get("experiment", {}).items() if k != "total_steps"}
-    return {**config, "experiment": experiment}
+def _without_steps(config: dict[str, Any]) -> dict[str, Any]:
+    try:  # a field that was added since then has the value that changed nothing
+        experiment = config_from_json(Experiment, config["experiment"])
+    except (KeyError, ValueError):
+        return config
+    return {**config, "experiment": config_to_json(_without_length(experiment))}
 
 
 def _find_or_train_needed(experiment: Experiment, runs: Path, num_threads: int) -> Trained | None:
     """The policies that a new run would stand on, trained now where there are none."""
     if experiment.needs is None:
         return None
-    try:
+    if _run_at(experiment.needs) is not None:
         needed = find_trained(experiment.needs, runs)
-    except RunError:
+    else:
         row = with_robot(find_row(experiment.needs), experiment.task.robot)
-        needed = train_row(row, (0,), runs, resume=True, num_threads=num_threads)
+        try:
+            needed = _find(row, runs)
+        except RunError:
+            needed = train_row(row, (0,), runs, resume=True, num_threads=num_threads)
     _check_fit(experiment, needed)
     return needed
 
@@ -126,7 +167,7 @@ def _check_fit(experiment: Experiment, needed: Trained) -> None:
     wanted, found = experiment.task.robot, needed.experiment.task.robot
     if wanted != found:
         raise ValueError(
-            f"{experiment.name} is for ant {wanted.name!r}, the {needed.experiment.name} found ({needed.source}) is "
+            f"{experiment.name} is for ant {wanted.name!r}, {needed.experiment.name} ({needed.source}) is "
             f"for another ({found.name!r}): footwork train {needed.experiment.name} --robot {wanted.name}"
         )
 
@@ -158,9 +199,20 @@ def load_run(run: RunDir) -> Trained:
 
 
 def finished_runs(row: str, runs: Path) -> list[RunDir]:
-    """Finished runs of a row, newest first."""
-    done = sorted((runs / row).glob("*/DONE"), key=lambda path: path.stat().st_mtime, reverse=True)
-    return [RunDir(path.parent) for path in done]
+    """Finished runs that count as the row, newest first."""
+    return _finished(find_row(row), runs)
+
+
+def _finished(experiment: Experiment, runs: Path) -> list[RunDir]:
+    done = sorted((runs / experiment.name).glob("*/DONE"), key=lambda path: path.stat().st_mtime, reverse=True)
+    return [run for run in (RunDir(path.parent) for path in done) if _counts_as(run, experiment)]
+
+
+def _counts_as(run: RunDir, experiment: Experiment) -> bool:
+    try:
+        return same_row(config_from_json(Experiment, run.config().get("experiment")), experiment)
+    except ValueError:  # damaged, or of a version with other fields
+        return False
 
 
 def packaged(row: str) -> Traversable:
@@ -168,19 +220,40 @@ def packaged(row: str) -> Traversable:
     return resources.files("footwork").joinpath("weights", *f"{row}.safetensors".split("/"))
 
 
-def find_trained(row: str, runs: Path) -> Trained:
-    """What a row name means: its newest finished run, else its packaged weights.
+def find_trained(address: str, runs: Path) -> Trained:
+    """What an address means: a row's newest finished run, else its packaged weights; or the run in that folder.
 
     Raises:
-        ValueError: the row is unknown.
-        RunError: it is known, and there is neither.
+        ValueError: it is neither a row nor the folder of a run.
+        RunError: it is a row, and there is neither a run nor packaged weights; or the run is not finished.
         CheckpointError: what was found is damaged.
     """
-    find_row(row)
-    for run in finished_runs(row, runs):
+    run = _run_at(address)
+    if run is None:
+        return _find(find_row(address), runs)
+    if not run.finished:
+        raise RunError(f"{address} holds an unfinished run")
+    return load_run(run)
+
+
+def _run_at(address: str) -> RunDir | None:
+    """The run in the folder of that path, unless it is a row's address."""
+    try:
+        find_row(address)
+    except ValueError:
+        return RunDir(Path(address)) if (Path(address) / "config.json").is_file() else None
+    return None
+
+
+def _find(experiment: Experiment, runs: Path) -> Trained:
+    """The newest finished run with these fields, else packaged weights that have them."""
+    for run in _finished(experiment, runs):
         return load_run(run)
+    row = experiment.name
     if packaged(row).is_file():
-        return _load_packaged(row)
+        trained = _load_packaged(row)
+        if same_row(trained.experiment, experiment):
+            return trained
     raise RunError(f"no finished run of {row} in {runs} and none in the package: footwork train {row}")
 
 

@@ -13,7 +13,7 @@ import pytest
 from footwork.arena import DIRECTIONS
 from footwork.autoreset import AutoReset
 from footwork.collect import collect, start
-from footwork.env import Env, host_scan
+from footwork.env import Env, host_jit, host_scan
 from footwork.learn.config import PPOConfig
 from footwork.learn.networks import categorical_policy, gaussian_policy
 from footwork.options import Options, SubPolicies
@@ -599,3 +599,29 @@ def test_bad_fields_are_refused(make, message):
 
 def test_the_rows_of_a_direction_stand_together():
     assert directions_of_rows(8, range(len(DIRECTIONS))) == (0, 0, 1, 1, 2, 2, 3, 3)
+
+
+# ---------------------------------------------------------------- host_jit
+
+
+def test_host_jit_gives_what_the_function_gives_and_passes_on_what_it_leaves_alone():
+    def function(scale, state, shift):
+        shifted = state["moves"] * scale + shift
+        return {"moves": shifted, "stays": state["stays"]}, (state["host"], shifted)
+
+    compiled = host_jit(function)
+    state = {"moves": jnp.arange(3.0), "stays": jnp.ones(2), "host": np.arange(4, dtype=np.int32)}
+    for scale in (2.0, 3.0):  # static: a trace of its own
+        expected, (_, shifted) = jax.jit(function, static_argnums=0)(scale, state, jnp.float32(0.5))
+        result, (host, second) = compiled(scale, state, jnp.float32(0.5))
+        np.testing.assert_array_equal(result["moves"], expected["moves"])
+        np.testing.assert_array_equal(second, shifted)
+        assert result["stays"] is state["stays"]
+        assert host is state["host"]
+
+
+def test_host_jit_within_a_jit_is_part_of_it():
+    compiled = host_jit(lambda scale, x, y: (x * scale, y))
+    result, y = jax.jit(lambda x, y: compiled(2.0, x, y))(jnp.ones(2), jnp.zeros(2))
+    np.testing.assert_array_equal(result, 2.0)
+    np.testing.assert_array_equal(y, 0.0)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from footwork.env import Environment, scan_over, split_phases
+from footwork.env import Environment, host_jit, scan_over, split_phases
 from footwork.learn.networks import Policy
 from footwork.types import Array, Float, Int, Key, Params, Transition
 
@@ -88,7 +88,7 @@ def _environment_step(env: Environment, policy: Policy, params: Params, key: Key
     return (state, step.obs), (transition, Tally(step.terms, step.events, step.terminated | step.truncated))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(host_jit, num_static=2)
 def _act(env: Environment, policy: Policy, params: Params, state: Any, obs: Array, key: Key, t: Any) -> Any:
     """The first jitted call of a step: every run's policy on its own rows, and the environment's begin."""
     act_key, env_key = jax.random.split(jax.random.fold_in(key, t))
@@ -100,13 +100,13 @@ def _act(env: Environment, policy: Policy, params: Params, state: Any, obs: Arra
     return env.begin(state, action, begin_key), action, log_prob.reshape(-1), simulate_key, finish_key
 
 
-@partial(jax.jit, static_argnums=0)
+@host_jit
 def _advance(env: Environment, state: Any, key: Key) -> Any:
     """The second jitted call of a step."""
     return env.finish(state, key)
 
 
-@partial(jax.jit, static_argnums=0)
+@host_jit
 def _summarise(num_runs: int, sums: EpisodeSums, transition: Transition, tally: Tally) -> Any:
     """Transitions by run, and the episodes that ended in this rollout."""
 

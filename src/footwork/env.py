@@ -14,8 +14,9 @@ lazily, at its next step: ``stale`` marks the rows it must overwrite first.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, wraps
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -24,6 +25,9 @@ import numpy as np
 
 from footwork.tasks.task import Task, last_finite
 from footwork.types import Array, Bool, Float, Int, Key, Physics, PhysicsState, TimeStep
+
+# What a host loop calls is small and full of random bits: to optimise them takes XLA seconds, and gains nothing.
+_COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 
 
 class Environment(Protocol):
@@ -63,6 +67,54 @@ class EnvState(NamedTuple):
     t: Int[Array, " N"]  # control steps of this episode so far
     held: Bool[Array, " N"]  # the episode has ended and no new one has begun
     stale: Bool[Array, " N"]  # the engine has yet to be told of this row's restart
+
+
+@jax.tree_util.register_pytree_node_class
+@dataclass(frozen=True)
+class _Changes:
+    """What a function returned, less the leaves that it returned as they were given."""
+
+    leaves: list[Any]
+    source: tuple[int | None, ...]  # of every leaf of the result: its place among the arguments' leaves, None: changed
+    tree: Any  # the result's structure
+
+    def tree_flatten(self) -> tuple[list[Any], tuple[Any, Any]]:
+        return self.leaves, (self.source, self.tree)
+
+    @classmethod
+    def tree_unflatten(cls, static: tuple[Any, Any], leaves: Any) -> _Changes:
+        return cls(list(leaves), *static)
+
+    def applied_to(self, given: list[Any]) -> Any:
+        """The function's result."""
+        changed = iter(self.leaves)
+        return self.tree.unflatten([next(changed) if place is None else given[place] for place in self.source])
+
+
+def host_jit(function: Callable[..., Any], num_static: int = 1) -> Callable[..., Any]:
+    """``jax.jit`` for the calls of a host loop; the first ``num_static`` arguments are static.
+
+    A state has some forty leaves, and a phase of a step changes few of them. XLA would
+    copy all others, which on a CPU takes longer than the phase: they pass by instead.
+    Within somebody else's jit the function is part of that.
+    """
+
+    @partial(jax.jit, static_argnums=tuple(range(num_static)), compiler_options=_COMPILER_OPTIONS)
+    @wraps(function)
+    def changes(*args: Any) -> _Changes:
+        places = {id(leaf): place for place, leaf in enumerate(jax.tree.leaves(args[num_static:]))}
+        leaves, tree = jax.tree.flatten(function(*args))
+        source = tuple(places.get(id(leaf)) for leaf in leaves)
+        return _Changes([leaf for leaf, place in zip(leaves, source, strict=True) if place is None], source, tree)
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        given = jax.tree.leaves(args[num_static:])
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in given):
+            return function(*args)
+        return changes(*args).applied_to(given)
+
+    return call
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +167,8 @@ class Env:
         else:
             held = np.asarray(state.held)
             moved = self.physics.step(physics, state.action, ~held if held.any() else None)
-        return state._replace(physics=moved, previous=before, stale=jnp.zeros_like(state.stale))
+        none: Any = np.zeros(self.num_envs, bool)
+        return state._replace(physics=moved, previous=before, stale=none)
 
     def finish(self, state: EnvState, key: Key) -> tuple[EnvState, TimeStep]:
         """Reward and end of the step; a held row earns nothing and ends nothing."""
@@ -160,7 +213,7 @@ class Env:
         return state, self.task.observe(physics, goal)
 
 
-@partial(jax.jit, static_argnums=0)  # step by step, JAX would compile each operation for itself: seconds
+@host_jit  # step by step, JAX would compile each operation for itself: seconds
 def _first_episodes(env: Env, physics: PhysicsState, key: Key) -> tuple[EnvState, Array]:
     off = jnp.zeros(env.num_envs, bool)
     state = EnvState(

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from footwork.env import Env, EnvState, scan_over
+from footwork.env import Env, EnvState, host_jit, scan_over
 from footwork.learn.networks import Policy
 from footwork.tasks.observe import WALKER_OBS_SIZE, turn_action, turn_observation
 from footwork.types import Array, Bool, Float, Int, Key, Params, Physics, TimeStep
@@ -124,14 +124,14 @@ class Options:
         return state._replace(inner=inner, obs=obs), obs
 
 
-@partial(jax.jit, static_argnums=0)
+@host_jit
 def _option_begin(env: Options, state: OptionsState, key: Key, i: Int[Array, ""]) -> OptionsState:
     act_key, begin_key = jax.random.split(jax.random.fold_in(key, 2 * i))
     action = env.sub_policies.act(state.obs, state.choice, act_key)
     return state._replace(inner=env.inner.begin(state.inner, action, begin_key))
 
 
-@partial(jax.jit, static_argnums=0)
+@host_jit
 def _option_finish(env: Options, state: OptionsState, key: Key, i: Int[Array, ""]) -> OptionsState:
     inner, step = env.inner.finish(state.inner, jax.random.fold_in(key, 2 * i + 1))
     return state._replace(inner=inner, obs=step.obs, total=accumulate(state.total, step))

@@ -7,6 +7,7 @@ import signal
 import time
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +21,7 @@ from footwork import checkpoint
 from footwork.arena import DIRECTIONS
 from footwork.autoreset import AutoReset
 from footwork.collect import Carry, collect, start
-from footwork.env import Env, Environment
+from footwork.env import Env, Environment, host_jit
 from footwork.learn import ppo
 from footwork.learn.config import PPOConfig
 from footwork.learn.networks import Policy, categorical_policy, gaussian_policy
@@ -175,10 +176,15 @@ def planned_steps(experiment: Experiment) -> int:
 
 def begin_learning(experiment: Experiment, env: Environment, seeds: tuple[int, ...]) -> Learning:
     """Fresh learners and first episodes. One root key per seed; the environment's comes from the first."""
-    policy, config = experiment.policy(), experiment.ppo
     keys = [jax.random.split(jax.random.fold_in(jax.random.key(seed), 0), experiment.runs_per_seed) for seed in seeds]
-    learners = jax.vmap(lambda key: ppo.init(policy, config, key))(jnp.concatenate(keys))
+    learners = fresh_learners(experiment.policy(), experiment.ppo, jnp.concatenate(keys))
     return Learning(0, learners, start(env, jax.random.fold_in(jax.random.key(seeds[0]), 1)))
+
+
+@partial(host_jit, num_static=2)
+def fresh_learners(policy: Policy, config: PPOConfig, keys: Key) -> ppo.TrainState:
+    """One learner per key."""
+    return jax.vmap(partial(ppo.init, policy, config))(keys)
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
@@ -190,19 +196,55 @@ def update_all(
     return jax.vmap(partial(ppo.update, policy, config))(learners, transition, keys)
 
 
-def iterate(experiment: Experiment, env: Environment, learning: Learning, seed: int) -> tuple[Learning, Metrics]:
-    """One rollout and one update; metrics have the leading axis of ``learning.learners``."""
+def compile_aside(experiment: Experiment, num_learners: int) -> Future[None]:
+    """Begin to compile :func:`update_all`, the longest compilation of a run, before there is a rollout to call it with.
+
+    Whatever else a start needs is compiled meanwhile, on another core.
+    """
+    aside = ThreadPoolExecutor(1, "compile")
+    compiling = aside.submit(_compile_update, experiment, num_learners)
+    aside.shutdown(wait=False)
+    return compiling
+
+
+def _compile_update(experiment: Experiment, num_learners: int) -> None:
+    policy, config = experiment.policy(), experiment.ppo
+    key = jax.eval_shape(jax.random.key, 0)
+
+    def arguments(key: Key) -> tuple[ppo.TrainState, Transition]:
+        learners = fresh_learners(policy, config, jax.random.split(key, num_learners))
+        shape = (num_learners, config.num_steps, config.num_envs)
+        number, flag, obs = jnp.zeros(shape), jnp.zeros(shape, bool), jnp.zeros((*shape, policy.obs_size))
+        action = policy.head.mode(jnp.zeros((*shape, policy.head.num_outputs)))
+        transition = Transition(obs, action, number, number, flag, flag, obs, flag)
+        return learners, _with_handovers(experiment, learners, transition)
+
+    update_all.lower(policy, config, *jax.eval_shape(arguments, key), key).compile()
+
+
+def iterate(
+    experiment: Experiment, env: Environment, learning: Learning, seed: int, compiling: Future[None] | None = None
+) -> tuple[Learning, Metrics]:
+    """One rollout and one update, which waits for ``compiling``; metrics have the leading axis of the learners."""
     policy, config = experiment.policy(), experiment.ppo
     root = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), learning.iteration)
     collect_key, update_key = jax.random.split(root)
     carry, transition, metrics = collect(
         env, policy, learning.learners.params, learning.carry, collect_key, config.num_steps
     )
-    regulariser = experiment.regulariser
-    if isinstance(regulariser, Interleaved) and regulariser.cooperative:
-        transition = expect_handovers(regulariser, experiment.symmetric, policy, learning.learners.params, transition)
+    transition = _with_handovers(experiment, learning.learners, transition)
+    if compiling is not None:
+        compiling.result()
     learners, update_metrics = update_all(policy, config, learning.learners, transition, update_key)
     return Learning(learning.iteration + 1, learners, carry), {**metrics, **update_metrics}
+
+
+def _with_handovers(experiment: Experiment, learners: ppo.TrainState, transition: Transition) -> Transition:
+    """The rollout, with what the learners expect of each other where the row's regulariser says that they do."""
+    regulariser = experiment.regulariser
+    if not (isinstance(regulariser, Interleaved) and regulariser.cooperative):
+        return transition
+    return expect_handovers(regulariser, experiment.symmetric, experiment.policy(), learners.params, transition)
 
 
 def train(
@@ -232,6 +274,7 @@ def train(
             cannot go on from.
     """
     env = build_environment(experiment, len(seeds), needed, num_threads)
+    compiling = compile_aside(experiment, len(seeds) * experiment.runs_per_seed)
     learning = _resume(run, env, begin_learning(experiment, env, seeds))
     per_iteration = steps_per_iteration(experiment)
     total = planned_steps(experiment)
@@ -248,7 +291,7 @@ def train(
     ):
         while learning.iteration < num_iterations:
             begun = time.monotonic()
-            learning, metrics = iterate(experiment, env, learning, seeds[0])
+            learning, metrics = iterate(experiment, env, learning, seeds[0], compiling)
             step = learning.iteration * per_iteration
             metrics = jax.tree.map(np.asarray, metrics)
             _check_finite({**metrics, "parameters": _largest(learning.learners.params)}, step, run)

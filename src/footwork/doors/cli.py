@@ -1,4 +1,4 @@
-"""The command line: ``footwork list | train | evaluate | transitions | quickstart``.
+"""The command line: ``footwork list | train | evaluate | transitions | quickstart | bench``.
 
 Only what a command needs is imported, and only once it is known which command it is:
 ``footwork --help`` answers at once.
@@ -6,7 +6,10 @@ Only what a command needs is imported, and only once it is known which command i
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import platform
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -88,14 +91,54 @@ class Quickstart:
     threads: int = 0  # of the physics; 0: all cores. Changes no number
 
 
+@dataclass(frozen=True)
+class Bench:
+    """Measure how fast all this is on this machine: beside the physics alone, and beside what others use.
+
+    Takes some ten minutes of a machine that has nothing else to do. Other libraries come
+    with the extra footwork[bench]; those that are not installed are skipped by name.
+    """
+
+    quick: bool = False  # about two minutes: fewer rounds, contestants and points
+    learning: bool = False  # also how long it takes to learn to walk, and to find the goal: minutes more
+    json: bool = False  # print JSON instead of tables
+    to: Path = Path("bench")  # where report.json and bench.png are left
+    rivals_python: str | None = None  # an interpreter that has the other libraries; default: this one
+
+
 def main() -> None:
     """The entry point."""
+    keep_compiled()
     sys.exit(run(sys.argv[1:]))
+
+
+def keep_compiled() -> None:
+    """Have JAX keep its compiled programs, so that only the first start of a kind has to wait for them.
+
+    They lie in the user's cache directory, for each kind of processor apart: they are machine
+    code. ``FOOTWORK_CACHE`` names another place, or is empty to keep nothing; JAX's own
+    variables go before. JAX is told by its environment, so that nothing is imported here.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    place = os.environ.get("FOOTWORK_CACHE", str(Path(base, "footwork")))
+    if place:
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(place, f"jax-{_processor()}")))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+def _processor() -> str:
+    """A name for what this processor can execute."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        abilities = next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        abilities = platform.processor()
+    return f"{platform.machine()}-{hashlib.sha256(abilities.encode()).hexdigest()[:12]}"
 
 
 def run(arguments: list[str]) -> int:
     """Run one command; what a user can mend is one line on stderr and exit status 1, 130 for an interrupt."""
-    commands: Any = List | Train | Evaluate | Transitions | Quickstart
+    commands: Any = List | Train | Evaluate | Transitions | Quickstart | Bench
     chosen, rest = tyro.cli(commands, args=arguments, prog="footwork", return_unknown_args=True)
     if rest and not isinstance(chosen, Train):
         print(f"footwork: unknown options: {' '.join(rest)}; see footwork {arguments[0]} --help", file=sys.stderr)
@@ -106,6 +149,7 @@ def run(arguments: list[str]) -> int:
         Evaluate: _evaluate,
         Transitions: _transitions,
         Quickstart: _quickstart,
+        Bench: _bench,
     }
     try:
         return actions[type(chosen)](chosen, rest)
@@ -242,6 +286,30 @@ def _played_on(trained: Trained, engine: str | None) -> Trained:
     experiment = trained.experiment if engine is None else replace(trained.experiment, engine=engine)
     require_engine(experiment.engine)
     return trained._replace(experiment=experiment)
+
+
+def _bench(command: Bench, rest: list[str]) -> int:
+    from footwork.checkpoint import write_atomically
+    from footwork.study import bench
+
+    python = command.rivals_python or sys.executable
+    work = bench.Bench(command.quick, command.learning, python, lambda line: print(line, file=sys.stderr))
+    work.run()
+    report = work.report()
+    text = json.dumps(report, indent=2)
+    command.to.mkdir(parents=True, exist_ok=True)
+    write_atomically(command.to / "report.json", text.encode() + b"\n")
+    if command.json:
+        print(text)
+    else:
+        from footwork.doors import tables
+
+        tables.show(*tables.bench_tables(report))
+    if report["contestants"]:
+        from footwork.study.figures import bench_figure
+
+        print(f"wrote {bench_figure(command.to / 'bench.png', report)}", file=sys.stderr)
+    return 0 if work.complete else 130
 
 
 def _at_least_one(name: str, value: int) -> None:

@@ -103,5 +103,70 @@ def _played(report: dict[str, Any]) -> str:
     return row if engine == own else f"{row} on {engine}"
 
 
+def bench_tables(report: dict[str, Any]) -> list[Table]:
+    """Contestants, what was asked for, and how cost grows."""
+    machine = report["machine"]
+    note = f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB, load {machine['load']}"
+    note += "; " + ", ".join(f"{name} {report['versions'][name]}" for name in ("footwork", "jax", "mujoco", "python"))
+    found = [_contestants_table(report["contestants"], note), _targets_table(report)]
+    return [*found, *(_growth_table(axis, points) for axis, points in report["growth"].items())]
+
+
+def _contestants_table(contestants: dict[str, Any], note: str) -> Table:
+    table = Table(title=f"control steps per second, median [least, largest]\n{note}", title_justify="left")
+    table.add_column("contestant", no_wrap=True)
+    for name in ("steps/s", "decisions/s", "over its physics", "to first update s", "compiling s", "peak MB"):
+        table.add_column(name, justify="right")
+    for name, record in contestants.items():
+        if "skipped" in record:
+            table.add_row(name, f"skipped: {record['skipped']}")
+            continue
+        rates = (_spread(record.get(key), form) for key, form in CONTESTANT_FIGURES)
+        table.add_row(name, *rates, *(_number(record.get(key)) for key in ("start_s", "compile_s", "peak_mb")))
+    return table
+
+
+CONTESTANT_FIGURES = (("steps_per_second", ",.0f"), ("decisions_per_second", ",.0f"), ("over_engine", ".2f"))
+
+
+def _targets_table(report: dict[str, Any]) -> Table:
+    table = Table(title="ratios, within each round", title_justify="left")
+    for name in ("figure", "median [least, largest]", "asked for", "reached"):
+        table.add_column(name, justify="left" if name == "figure" else "right", no_wrap=True)
+    figures = {**{key: report[key] for key in report["targets"]}, "compile_s": report["compile_s"]}
+    for key in {**figures, "peak_mb": 0, **report["ratios"]}:
+        if report.get(key) is None:
+            continue
+        ratio, target = report["ratios"].get(key), report["targets"].get(key, {"asked": "", "reached": None})
+        shown = _number(report[key], ".2f") if ratio is None else _spread(ratio, ".2f")
+        table.add_row(key, shown, target["asked"], {True: "yes", False: "no", None: ""}[target["reached"]])
+    return table
+
+
+def _growth_table(axis: str, points: list[dict[str, Any]]) -> Table:
+    table = Table(title=f"how cost grows with {axis}", title_justify="left")
+    for name in (axis, "steps/s", "over physics alone", "to first update s", "compiling s", "peak MB"):
+        table.add_column(name, justify="right")
+    for point in points:
+        if "skipped" in point:
+            table.add_row(str(point["size"]), f"skipped: {point['skipped']}")
+            continue
+        rates = (_spread(point["steps_per_second"], ",.0f"), _spread(point["over_reference"], ".2f"))
+        table.add_row(
+            str(point["size"]), *rates, *(_number(point.get(key)) for key in ("start_s", "compile_s", "peak_mb"))
+        )
+    return table
+
+
+def _spread(figures: dict[str, Any] | None, form: str) -> str:
+    if figures is None:
+        return ""
+    return f"{figures['median']:{form}} [{figures['low']:{form}}, {figures['high']:{form}}]"
+
+
+def _number(value: float | None, form: str = ",.1f") -> str:
+    return "" if value is None else f"{value:{form}}"
+
+
 def _rate(rate: float, interval: list[float]) -> str:
     return f"{100 * rate:.1f} [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"

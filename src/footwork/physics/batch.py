@@ -99,12 +99,21 @@ class BatchPhysics:
         ids = None if active is None else np.sort(simulation[np.flatnonzero(active)])
         if ids is None or ids.size:
             try:
-                self._batch.step(ids, nstep=self._substeps)
+                self.move(ids)
             except mujoco.batch.SimulationError as error:
                 self._failed[error.ids] = True
             rows = slice(None) if ids is None else ids
             self._touching[rows] = self._sensors[rows] > 0
         return self._read(simulation)
+
+    def move(self, ids: np.ndarray | None = None) -> None:
+        """The engine's own part of a control step: moves the simulations ``ids`` (rising; None: all) by ``ctrl``."""
+        self._batch.step(ids, nstep=self._substeps)
+
+    @property
+    def ctrl(self) -> np.ndarray:
+        """The engine's live actions, [N, 8]; for who measures the engine alone."""
+        return self._ctrl
 
     def snapshot(self) -> dict[str, Any]:
         """The engine's rows (positions, velocities, warm starts, time), contacts and failure flags."""

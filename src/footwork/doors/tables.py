@@ -8,6 +8,9 @@ from rich.console import Console
 from rich.table import Table
 
 from footwork.arena import DIRECTIONS
+from footwork.study.claims import Judgement
+from footwork.study.experiments import GRIDS, group_of
+from footwork.study.plan import Job
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment
 
@@ -21,23 +24,55 @@ def show(*tables: Table) -> None:
         console.print(table)
 
 
-def rows_table(experiments: list[Experiment], found: dict[str, str]) -> Table:
-    """What each row trains, on what, and whether trained policies are at hand."""
+def rows_table(experiments: list[Experiment], found: dict[str, str], every_row: bool = False) -> Table:
+    """What each row trains, on what, and whether trained policies are at hand; grids in one line each."""
     table = Table(title="rows", title_justify="left")
     for column in ("row", "trains", "task", "needs", "S", "k", "control steps", "trained"):
         table.add_column(column, justify="right" if column in ("S", "k", "control steps") else "left", no_wrap=True)
+    grids = {row.name: grid for grid in GRIDS for row in grid.rows()}
+    last = ""
     for row in experiments:
-        kind = "master" if row.is_master else "sub-policies" if row.is_walker else "flat policy"
-        table.add_row(
-            row.name,
-            kind,
-            row.task.name,
-            row.needs or "",
-            str(row.ppo.batch_size),
-            str(row.option_steps) if row.is_master else "",
-            f"{row.total_steps:,}" + (" x 4" if row.runs_per_seed > 1 else ""),
-            found[row.name],
-        )
+        grid = grids.get(row.name)
+        top = row.name.partition("/")[0] if grid else group_of(row.name)
+        if last and top != last:
+            table.add_section()
+        last = top
+        if grid is None or every_row:
+            table.add_row(*_row_cells(row, row.name, found[row.name]))
+        elif row.name.endswith(f"/{grid.values[0]}"):
+            name = f"{grid.name}/{{{', '.join(map(str, grid.values))}}}"
+            trained = sum(bool(found[f"{grid.name}/{value}"]) for value in grid.values)
+            table.add_row(*_row_cells(row, name, f"{trained} of {len(grid.values)}" if trained else "", grid.field))
+    return table
+
+
+def _row_cells(row: Experiment, name: str, found: str, varied: str = "") -> tuple[str, ...]:
+    """One line of the table of rows; ``varied`` is the field that differs among the rows it stands for."""
+    kind = "master" if row.is_master else "sub-policies" if row.is_walker else "flat policy"
+    k = ("..." if varied == "option_steps" else str(row.option_steps)) if row.is_master else ""
+    steps = f"{row.total_steps:,}" + (" x 4" if row.runs_per_seed > 1 else "")
+    return name, kind, row.task.name, row.needs or "", str(row.ppo.batch_size), k, steps, found
+
+
+def plan_table(jobs: list[Job], size: str) -> Table:
+    """What a study would run: seeds and control steps of each row."""
+    total = sum(job.steps for job in jobs)
+    table = Table(title=f"{size} study: {len(jobs)} runs, {total:,} control steps", title_justify="left")
+    for column in ("row", "seeds", "control steps"):
+        table.add_column(column, justify="left" if column == "row" else "right", no_wrap=True)
+    for row in dict.fromkeys(job.row for job in jobs):
+        mine = [job for job in jobs if job.row == row]
+        table.add_row(row, str(len(mine)), f"{sum(job.steps for job in mine):,}")
+    return table
+
+
+def claims_table(judgements: list[Judgement], size: str) -> Table:
+    """Verdicts, one line per claim and setting."""
+    table = Table(title="claims" if size == "full" else f"claims ({size} study)", title_justify="left")
+    for column in ("", "claim", "where", "verdict", "because"):
+        table.add_column(column, justify="right" if column == "" else "left")
+    for j in judgements:
+        table.add_row(str(j.claim.number), j.claim.words, j.where, j.verdict, j.why)
     return table
 
 

@@ -7,7 +7,10 @@ a replication of the whole system, and intervals over seeds hold all of its luck
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import platform
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -160,7 +163,7 @@ def mark(study: Study) -> None:
     if study.size.short and any(study.runs.glob("*/**/config.json")):
         raise RunError(f"{study.runs} holds runs of their full length, not of the quick study: choose another --runs")
     study.runs.mkdir(parents=True, exist_ok=True)
-    content = {"format": _FORMAT, "size": study.size.name, "footwork": footwork.__version__}
+    content = {"format": _FORMAT, "size": study.size.name, "footwork": footwork.__version__, "machine": _machine()}
     checkpoint.write_atomically(path, json.dumps(content).encode() + b"\n")
 
 
@@ -178,3 +181,21 @@ def read_mark(runs: Path) -> Size:
         return SIZES[content["size"]]
     except (OSError, ValueError, KeyError, TypeError):
         raise RunError(f"{path} is damaged or of another version of footwork") from None
+
+
+def read_machine(runs: Path) -> str:
+    """What the study was begun on, in words; nothing where that is not known."""
+    try:
+        return str(json.loads((runs / STUDY_FILE).read_bytes()).get("machine", ""))
+    except (OSError, ValueError, AttributeError):
+        return ""
+
+
+def _machine() -> str:
+    """Processor, cores, memory and system, without names of anybody's."""
+    model = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        model = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return f"{model}, {os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()}"

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from footwork.arena import DIRECTIONS
-from footwork.checkpoint import write_atomically
+from footwork.checkpoint import CheckpointError, write_atomically
 from footwork.record import RunDir, RunError, config_from_json, read_metrics
 from footwork.study.measure import EVALUATION, TRANSITIONS, problem_with
 from footwork.study.plan import Study
@@ -84,14 +84,14 @@ class Results:
         """The training curves of a row's seeds."""
         found = []
         for sample in self.samples(row):
-            curve = self._curve(sample)
+            curve = self.whole_curve(sample)
             if curve is not None:
                 found.append((sample, _of_seed(curve, sample)))
         return found
 
     def measurements(self, row: str, name: str) -> list[dict[str, Any]]:
         """The entries of a file of measurements, one per seed that has them."""
-        entries = (self._entry(sample, name) for sample in self.samples(row))
+        entries = (self.entry(sample, name) for sample in self.samples(row))
         return [entry for entry in entries if entry is not None]
 
     def scores(self, row: str, metric: str) -> Floats:
@@ -103,7 +103,12 @@ class Results:
         measure = METRICS[metric]
         return np.array([value for s in self.samples(row) if (value := measure.of(self, s)) is not None], np.float64)
 
-    def _curve(self, sample: Sample) -> Curve | None:
+    def all_samples(self) -> dict[str, tuple[Sample, ...]]:
+        """Every row that has been asked for so far, and its seeds."""
+        return dict(self._samples)
+
+    def whole_curve(self, sample: Sample) -> Curve | None:
+        """The curve of a sample's run, all its seeds; None, and a problem, where it cannot be read."""
         path = sample.run.path
         if path not in self._curves:
             try:
@@ -113,7 +118,8 @@ class Results:
                 return None
         return self._curves[path]
 
-    def _entry(self, sample: Sample, name: str) -> dict[str, Any] | None:
+    def entry(self, sample: Sample, name: str) -> dict[str, Any] | None:
+        """What a file of measurements says of a sample; None, and a problem, where it cannot be read."""
         key = (sample.run.path, name)
         if key not in self._files:
             problem = problem_with(sample.run, name)
@@ -204,9 +210,18 @@ def read_curve(run: RunDir, experiment: Experiment) -> Curve:
         curve = _bin(lines, steps_per_iteration(experiment), len(run.config()["seeds"]))
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{run.metrics_path} is of another version of footwork: {error!r}") from None
-    with contextlib.suppress(OSError):  # a folder that cannot be written is read again the next time
-        write_atomically(kept, json.dumps(_curve_to_json(curve, size)).encode() + b"\n")
+    with contextlib.suppress(CheckpointError):  # a folder that cannot be written is read again the next time
+        write_curve(kept, curve, size)
     return curve
+
+
+def write_curve(path: Path, curve: Curve, metrics_bytes: int | None) -> None:
+    """Write a curve, and how large the file of metrics was that it was made from.
+
+    Raises:
+        CheckpointError: it cannot be written.
+    """
+    write_atomically(path, json.dumps(_curve_to_json(curve, metrics_bytes)).encode() + b"\n")
 
 
 def _bin(lines: list[dict[str, Any]], steps_per_line: int, num_seeds: int) -> Curve:
@@ -230,7 +245,7 @@ def _sum_of(lines: list[dict[str, Any]], key: str, count: Floats) -> Floats:
     return np.where(count > 0, mean, 0.0) * count
 
 
-def _curve_to_json(curve: Curve, metrics_bytes: int) -> dict[str, Any]:
+def _curve_to_json(curve: Curve, metrics_bytes: int | None) -> dict[str, Any]:
     rounded = {
         name: [[None if np.isnan(x) else float(f"{x:.5g}") for x in row] for row in value]
         for name, value in curve.values.items()
@@ -290,7 +305,7 @@ class Metric:
 
 
 def _final_return(results: Results, sample: Sample) -> Any:
-    curve = results._curve(sample)
+    curve = results.whole_curve(sample)
     returns = None if curve is None else final(_of_seed(curve, sample), "return")
     if returns is None or np.isnan(returns).any():
         results.problems[f"{sample.run.path}: no episode ended in the last tenth of training"] = None
@@ -304,19 +319,19 @@ def _mean_final_return(results: Results, sample: Sample) -> float | None:
 
 
 def _evaluated(name: str, results: Results, sample: Sample) -> float | None:
-    entry = results._entry(sample, EVALUATION)
+    entry = results.entry(sample, EVALUATION)
     value = None if entry is None else entry.get(name)
     return value["1.0"] if isinstance(value, dict) else value
 
 
 def _speed(results: Results, sample: Sample) -> float | None:
-    entry = results._entry(sample, EVALUATION)
+    entry = results.entry(sample, EVALUATION)
     return None if entry is None else float(np.mean([entry["speed_mps"][name] for name in DIRECTIONS]))
 
 
 def _handover(results: Results, sample: Sample) -> float | None:
     """Between orthogonal directions: the eight of the sixteen pairs that are a quarter turn apart."""
-    entry = results._entry(sample, TRANSITIONS)
+    entry = results.entry(sample, TRANSITIONS)
     if entry is None:
         return None
     pairs = [(i, (i + turn) % 4) for i in range(4) for turn in (1, 3)]

@@ -186,7 +186,7 @@ def hierarchy(results: Results, rows: tuple[str, ...]) -> Any:
         _arrow(ax, (x + 1.75, 4.3), (9.8, 2.7), DIRECTION_COLOURS[i])
     _box(ax, 5.2, 0.9, 9.2, 1.6, "ant in its task", "8 torques every control step (16.5 ms)", "#FBF3EA", _LIMB)
     _route(ax, [(5.1, 1.7), (1.2, 1.7), (1.2, 8.4), (5.1, 8.4)])
-    ax.text(1.4, 9.0, "all observations (34 or 36)", fontsize=8, va="center", color="#555555")
+    ax.text(1.4, 9.15, "all observations\n(34 or 36)", fontsize=8, va="center", color="#555555")
     ax.text(1.4, 7.8, "sum of k rewards", fontsize=8, va="center", color="#555555")
     _route(ax, [(14.5, 1.7), (18.9, 1.7), (18.9, 5.1), (17.6, 5.1)])
     ax.text(14.8, 1.1, "first 32 observations, to each", fontsize=8, va="center", color="#555555")

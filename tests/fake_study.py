@@ -64,21 +64,25 @@ def metrics(experiment, good, steps, key, lines):
         share = i / min(lines, total)
         learned = good * (1 - np.exp(-5 * share)) + key.normal(0, 0.02, runs)
         count = np.maximum(key.integers(0, 6, runs), share == 1)
-        mean = lambda value, count=count: [float(v) if n else "nan" for v, n in zip(value, count, strict=True)]
         yield {
             "step": round(total * share) * steps_per_iteration(experiment),
             "episode/count": count.tolist(),
-            "episode/return": mean(2800 * learned),
-            "episode/progress": mean(whole * learned),
+            "episode/return": mean(2800 * learned, count),
+            "episode/progress": mean(whole * learned, count),
             "count/reached": np.round(np.clip(learned, 0, 1) * count).astype(int).tolist(),
             "time/steps_per_second": 9000.0 + float(key.normal(0, 300)),
         }
 
 
+def mean(value, count):
+    """Of a bin's episodes, as metrics have it."""
+    return [float(v) if n else "nan" for v, n in zip(value, count, strict=True)]
+
+
 def evaluation(experiment, good, seed, key, episodes=60):
     figures = {"seed": seed, "episodes": episodes, "fall_rate": 0.1, "flip_rate": 0.05, "progress_m": 8 * good}
     if experiment.is_walker:
-        return {**figures, "speed_mps": {name: 1 + 1.5 * good for name in DIRECTIONS}}
+        return {**figures, "speed_mps": dict.fromkeys(DIRECTIONS, 1 + 1.5 * good)}
     arena = experiment.task.arena
     start, goal = np.array(arena.start), np.array(arena.goals[0])
     stop = straight_line_stop(arena)
@@ -86,7 +90,7 @@ def evaluation(experiment, good, seed, key, episodes=60):
     ends = np.where(there[:, None], goal, start if stop is None else stop) + key.normal(0, 0.3, (episodes, 2))
     return {
         **figures,
-        "success": {radius: good for radius in ("0.45", "0.5", "1.0", "5.0")},
+        "success": dict.fromkeys(("0.45", "0.5", "1.0", "5.0"), good),
         "way": good,
         "closest_m": 1.0,
         "time_to_goal_s": 12.0,
@@ -112,10 +116,9 @@ def handover(good, key):
 
 
 def switching(good, key):
-    entry = lambda k: {
-        "speed_mps": good * (0.6 + k / 200),
-        "idle": (1 - good) * 0.5,
-        "upside_down": 0.2 * k / 200,
-        "fallen": 0.1,
+    idle, down = (1 - good) * 0.5, 0.2 / 200
+    speeds = {k: good * (0.6 + k / 200) for k in SWITCHING_PERIODS}
+    return {
+        str(k): {"speed_mps": speed, "idle": idle, "upside_down": down * k, "fallen": 0.1}
+        for k, speed in speeds.items()
     }
-    return {str(k): entry(k) for k in SWITCHING_PERIODS}

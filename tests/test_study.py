@@ -8,8 +8,8 @@ import shutil
 
 import numpy as np
 import pytest
-from fake_study import fake_run, write
 
+from fake_study import fake_run, write
 from footwork.arena import MAZES
 from footwork.doors.cli import run
 from footwork.evaluate import Episodes
@@ -59,7 +59,9 @@ def test_rows_of_another_ant_stand_on_rows_of_that_ant():
 
 def test_patterns_mean_rows():
     assert match_rows(()) == list(EXPERIMENTS)
-    assert match_rows(["maze/flat/*"]) == [f"maze/flat/{k}" for k in ("penalised", "free", "guided-penalised", "guided-free")]
+    assert match_rows(["maze/flat/*"]) == [
+        f"maze/flat/{k}" for k in ("penalised", "free", "guided-penalised", "guided-free")
+    ]
     with pytest.raises(ValueError, match=r"no row matches 'maze/fast/\*'; known rows: walker/\*, "):
         match_rows(["maze/fast/*"])
 
@@ -73,7 +75,12 @@ def test_a_plan_makes_what_a_run_stands_on_first_and_every_row_before_the_second
     assert first == ["walker/plain", "walker/appropriate-bias", "maze/hrl/appropriate-bias", "walker/symmetric"]
     assert [job.seed for job in jobs] == sorted(job.seed for job in jobs)
     seeds = {row: sum(job.row == row for job in jobs) for row in first}
-    assert seeds == {"walker/plain": 10, "walker/appropriate-bias": 10, "maze/hrl/appropriate-bias": 10, "walker/symmetric": 3}
+    assert seeds == {
+        "walker/plain": 10,
+        "walker/appropriate-bias": 10,
+        "maze/hrl/appropriate-bias": 10,
+        "walker/symmetric": 3,
+    }
     assert {job.steps for job in jobs if job.row == "walker/plain"} == {4 * 1_998_848}
     assert len(plan.plan(study, ["walker/plain"], [], seeds=2)) == 2
     with pytest.raises(ValueError, match="seeds must be >= 1, got 0"):
@@ -329,7 +336,14 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
     found = results.Results(study)
     pages = report.write_report(found, tmp_path / "report", "footwork reproduce")
     text, page = (path.read_text() for path in pages)
-    for words in ("## Claims", "## The paper, in its order", "## Figures", "## Rows", "seed-2 is not finished", "mujoco"):
+    for words in (
+        "## Claims",
+        "## The paper, in its order",
+        "## Figures",
+        "## Rows",
+        "seed-2 is not finished",
+        "mujoco",
+    ):
         assert words in text
     assert text.index("## Claims") < text.index("## The paper") < text.index("## Figures")
     assert not re.search(r'(src|href)="(?!data:)', page)  # nothing but what is in the page itself

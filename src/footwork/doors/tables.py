@@ -9,7 +9,7 @@ from rich.table import Table
 
 from footwork.arena import DIRECTIONS
 from footwork.study.claims import Judgement
-from footwork.study.experiments import GRIDS, group_of
+from footwork.study.experiments import group_of
 from footwork.study.plan import Job
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment
@@ -25,31 +25,51 @@ def show(*tables: Table) -> None:
 
 
 def rows_table(experiments: list[Experiment], found: dict[str, str], every_row: bool = False) -> Table:
-    """What each row trains, on what, and whether trained policies are at hand; grids in one line each."""
-    table = Table(title="rows", title_justify="left")
+    """What each row trains, on what, and whether trained policies are at hand; variations in short."""
+    title = "rows" if every_row else "rows (variations in short: --all shows them)"
+    table = Table(title=title, title_justify="left")
     for column in ("row", "trains", "task", "needs", "S", "k", "control steps", "trained"):
         table.add_column(column, justify="right" if column in ("S", "k", "control steps") else "left", no_wrap=True)
-    grids = {row.name: grid for grid in GRIDS for row in grid.rows()}
-    last = ""
+    groups: dict[str, list[Experiment]] = {}
     for row in experiments:
-        grid = grids.get(row.name)
-        top = row.name.partition("/")[0] if grid else group_of(row.name)
-        if last and top != last:
+        groups.setdefault(group_of(row.name), []).append(row)
+    last = ""
+    for group, rows in groups.items():
+        short = not every_row and _in_one_line(group)
+        section = group.partition("/")[0] if short and not group.endswith("-penalised") else group
+        if last and section != last:
             table.add_section()
-        last = top
-        if grid is None or every_row:
+        last = section
+        if short and len(rows) > 1:
+            values = ", ".join(row.name.rpartition("/")[2] for row in rows)
+            name = f"{group}/{{{values}}}" if len(values) < 24 else f"{group}/... ({len(rows)})"
+            trained = sum(bool(found[row.name]) for row in rows)
+            cells = _row_cells(rows[0], name, f"{trained} of {len(rows)}" if trained else "")
+            table.add_row(*_where_they_agree(cells, [_row_cells(row, "", "") for row in rows]))
+            continue
+        for row in rows:
             table.add_row(*_row_cells(row, row.name, found[row.name]))
-        elif row.name.endswith(f"/{grid.values[0]}"):
-            name = f"{grid.name}/{{{', '.join(map(str, grid.values))}}}"
-            trained = sum(bool(found[f"{grid.name}/{value}"]) for value in grid.values)
-            table.add_row(*_row_cells(row, name, f"{trained} of {len(grid.values)}" if trained else "", grid.field))
     return table
 
 
-def _row_cells(row: Experiment, name: str, found: str, varied: str = "") -> tuple[str, ...]:
-    """One line of the table of rows; ``varied`` is the field that differs among the rows it stands for."""
+def _in_one_line(group: str) -> bool:
+    """Whether a group is a variation of others, and listed in short."""
+    return group.partition("/")[0] in ("ablation", "light") or group.endswith("-penalised")
+
+
+def _where_they_agree(cells: tuple[str, ...], others: list[tuple[str, ...]]) -> tuple[str, ...]:
+    """Cells of a line that stands for several rows: dots where the rows differ; its name and what is trained stay."""
+    same = [len({other[i] for other in others}) == 1 for i in range(len(cells))]
+    return tuple(
+        cell if agree or i in (0, len(cells) - 1) else "..."
+        for i, (cell, agree) in enumerate(zip(cells, same, strict=True))
+    )
+
+
+def _row_cells(row: Experiment, name: str, found: str) -> tuple[str, ...]:
+    """One line of the table of rows."""
     kind = "master" if row.is_master else "sub-policies" if row.is_walker else "flat policy"
-    k = ("..." if varied == "option_steps" else str(row.option_steps)) if row.is_master else ""
+    k = str(row.option_steps) if row.is_master else ""
     steps = f"{row.total_steps:,}" + (" x 4" if row.runs_per_seed > 1 else "")
     return name, kind, row.task.name, row.needs or "", str(row.ppo.batch_size), k, steps, found
 

@@ -459,8 +459,10 @@ def show_effect(finding: Finding) -> str:
     """The effect with its interval, in the metric's unit."""
     if finding.effect is None:
         return "-"
-    show = METRICS[finding.contrast.metric].show
-    return f"{show(finding.effect.estimate)} [{show(finding.effect.low)}, {show(finding.effect.high)}]"
+    estimate, low, high = finding.effect
+    if METRICS[finding.contrast.metric].percent:
+        return f"{100 * estimate:.1f} [{100 * low:.1f}, {100 * high:.1f}] %"
+    return f"{estimate:.4g} [{low:.4g}, {high:.4g}]"
 
 
 __all__ = [

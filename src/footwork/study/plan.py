@@ -156,9 +156,8 @@ def mark(study: Study) -> None:
     if path.is_file():
         found = read_mark(study.runs)
         if found != study.size:
-            raise RunError(
-                f"{study.runs} holds the {found.name} study, not the {study.size.name}: choose another --runs"
-            )
+            held, asked = found.name, study.size.name
+            raise RunError(f"{study.runs} holds the {held} study, not the {asked} one: choose another --runs")
         return
     if study.size.short and any(study.runs.glob("*/**/config.json")):
         raise RunError(f"{study.runs} holds runs of their full length, not of the quick study: choose another --runs")

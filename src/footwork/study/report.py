@@ -20,7 +20,7 @@ import numpy as np
 
 import footwork
 from footwork.checkpoint import write_atomically
-from footwork.study.claims import CLAIMS, Judgement, judge_all, prefixes_at_hand, rows_read, show_effect
+from footwork.study.claims import CLAIMS, Finding, Judgement, judge_all, prefixes_at_hand, rows_read, show_effect
 from footwork.study.experiments import EXPERIMENTS, find_row
 from footwork.study.figures import FIGURES, Drawn, draw_figures
 from footwork.study.measure import EVALUATION, TRANSITIONS
@@ -190,14 +190,15 @@ def _known(row: str) -> bool:
 def _claims_table(judgements: Sequence[Judgement]) -> TableBlock:
     rows = []
     for j in judgements:
-        deciding = [f for f in j.findings if f.contrast.decides]
-        effects = "\n".join(f"{f.contrast.words}: {show_effect(f)}" for f in deciding)
-        chance = "\n".join("-" if f.probability is None else f"{f.probability:.2f}" for f in deciding)
-        seeds = "\n".join(_seeds(f.seeds) for f in deciding)
-        rows.append(
-            (str(j.claim.number), f"{j.claim.words}\n({_source(j)})", j.where, j.verdict, effects, chance, seeds, j.why)
-        )
-    return TableBlock(("", "claim", "where", "verdict", "effect [95 %]", "P", "seeds", "because"), tuple(rows))
+        said = "\n".join(_said(f) for f in j.findings if f.contrast.decides)
+        rows.append((str(j.claim.number), f"{j.claim.words}\n({_source(j)})", j.where, j.verdict, said, j.why))
+    return TableBlock(("", "claim", "where", "verdict", "effect [95 %], P, seeds", "because"), tuple(rows))
+
+
+def _said(finding: Finding) -> str:
+    """A comparison in one line."""
+    chance = "" if finding.probability is None else f", P {finding.probability:.2f}"
+    return f"{finding.contrast.words}: {show_effect(finding)}{chance}, {_seeds(finding.seeds)} seeds"
 
 
 def _source(judgement: Judgement) -> str:
@@ -301,13 +302,13 @@ def export(results: Results, to: Path) -> None:
     if to.is_dir():
         shutil.rmtree(to)
     for row, samples in results.all_samples().items():
-        for run in dict.fromkeys(sample.run for sample in samples):
+        for run, sample in {sample.run: sample for sample in samples}.items():
             place = to / row / run.path.name
             place.mkdir(parents=True, exist_ok=True)
             for name in ("config.json", "DONE", EVALUATION, TRANSITIONS):
                 if (run.path / name).is_file():
                     shutil.copyfile(run.path / name, place / name)
-            curve = results.whole_curve(samples[0])
+            curve = results.whole_curve(sample)
             if curve is not None:
                 write_curve(place / CURVE, curve, None)
     if (results.study.runs / STUDY_FILE).is_file():

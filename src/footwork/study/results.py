@@ -210,6 +210,7 @@ def read_curve(run: RunDir, experiment: Experiment) -> Curve:
         curve = _bin(lines, steps_per_iteration(experiment), len(run.config()["seeds"]))
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{run.metrics_path} is of another version of footwork: {error!r}") from None
+    curve = _curve_from_json(_curve_to_json(curve, size))  # rounded now as it will be when it is read again
     with contextlib.suppress(CheckpointError):  # a folder that cannot be written is read again the next time
         write_curve(kept, curve, size)
     return curve

@@ -158,9 +158,7 @@ def _only_one(runs: Path) -> Iterator[None]:
 
 
 def steps_of(study: Study, job: Job) -> int:
-    """Control steps that an unfinished run has taken, from the last whole line of its metrics; less those that
-    measuring it will take the time of.
-    """
+    """Control steps that an unfinished run has taken, less a share for the time that measuring it will take."""
     path = run_path(study.runs, job.row, (job.seed,)) / "metrics.jsonl"
     try:
         with path.open("rb") as file:

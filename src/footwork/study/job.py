@@ -20,7 +20,7 @@ from typing import Any
 from footwork import checkpoint
 from footwork.record import RunDir, RunError, config_to_json
 from footwork.study.measure import measure, measured
-from footwork.study.plan import SIZES, Job, Study
+from footwork.study.plan import Job, Size, Study
 from footwork.study.results import find_samples, read_curve
 from footwork.study.runs import NEEDED, load_run, run_path, train_row
 from footwork.train import Experiment, Interrupted, TrainingDiverged, policy_meta
@@ -99,7 +99,7 @@ def main(arguments: list[str]) -> int:
     if asked.get("core") is not None and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {asked["core"]})
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    study = Study(Path(asked["runs"]), SIZES[asked["size"]])
+    study = Study(Path(asked["runs"]), Size.from_json(asked["size"]))
     deadline = time.monotonic() + WAIT_FOR_LOCK
     while True:
         try:

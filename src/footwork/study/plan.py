@@ -14,6 +14,7 @@ import platform
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import footwork
 from footwork import checkpoint
@@ -38,7 +39,7 @@ class Size:
         walker_episodes: per seed, of sub-policies.
         ants: per seed and period of random switching, and a quarter of it per pair of the hand-over matrix.
         periods: of random switching, control steps.
-        short: runs are cut to a few updates.
+        short: most control steps of sub-policies (each direction), of symmetric ones, of masters, of flat policies.
     """
 
     name: str
@@ -48,14 +49,18 @@ class Size:
     walker_episodes: int
     ants: int
     periods: tuple[int, ...]
-    short: bool = False
+    short: tuple[int, int, int, int] | None = None
+
+    @classmethod
+    def from_json(cls, fields: dict[str, Any]) -> Size:
+        """The inverse of ``dataclasses.asdict``, whatever JSON made of tuples."""
+        given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
+        return cls(**given)
 
 
 FULL = Size("full", 10, 3, 200, 64, 128, SWITCHING_PERIODS)
-QUICK = Size("quick", 2, 1, 32, 16, 32, (50, 200), short=True)
+QUICK = Size("quick", 2, 1, 32, 16, 32, (50, 200), short=(20_480, 40_960, 38_400, 40_960))
 SIZES = {size.name: size for size in (FULL, QUICK)}
-
-_SHORT_WALKER, _SHORT_SYMMETRIC, _SHORT_MASTER, _SHORT_FLAT = 40_960, 81_920, 64_000, 51_200  # control steps
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,7 @@ class Study:
             ValueError: there is no such row.
         """
         row = find_row(name)
-        return _shortened(row) if self.size.short else row
+        return row if self.size.short is None else _shortened(row, self.size.short)
 
 
 @dataclass(frozen=True)
@@ -90,20 +95,17 @@ class Job:
         return f"{self.row} seed {self.seed}"
 
 
-def _shortened(row: Experiment) -> Experiment:
+def _shortened(row: Experiment, most: tuple[int, int, int, int]) -> Experiment:
     """A few updates of the row; schedules end with the run, as they do in the whole one."""
-    if row.is_walker:
-        steps = _SHORT_SYMMETRIC if row.symmetric else _SHORT_WALKER
-    else:
-        steps = _SHORT_MASTER if row.is_master else _SHORT_FLAT
-    steps = min(steps, row.total_steps)
+    kind = (1 if row.symmetric else 0) if row.is_walker else 2 if row.is_master else 3
+    steps = min(most[kind], row.total_steps)
     anneal = None if row.ppo.anneal_updates is None else max(1, steps // row.ppo.batch_size)
     return replace(row, total_steps=steps, ppo=replace(row.ppo, anneal_updates=anneal))
 
 
 def default_rows(size: Size, read_by_claims: Sequence[str]) -> list[str]:
     """All rows; of a short study those that a claim reads, and the ends of each grid."""
-    if not size.short:
+    if size.short is None:
         return match_rows(())
     ends = [f"{grid.name}/{value}" for grid in GRIDS for value in dict.fromkeys((grid.values[0], grid.values[-1]))]
     return [*read_by_claims, *ends, "light/walker/plain"]
@@ -159,7 +161,7 @@ def mark(study: Study) -> None:
             held, asked = found.name, study.size.name
             raise RunError(f"{study.runs} holds the {held} study, not the {asked} one: choose another --runs")
         return
-    if study.size.short and any(study.runs.glob("*/**/config.json")):
+    if study.size.short is not None and any(study.runs.glob("*/**/config.json")):
         raise RunError(f"{study.runs} holds runs of their full length, not of the quick study: choose another --runs")
     study.runs.mkdir(parents=True, exist_ok=True)
     content = {"format": _FORMAT, "size": study.size.name, "footwork": footwork.__version__, "machine": _machine()}

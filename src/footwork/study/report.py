@@ -131,7 +131,7 @@ def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> lis
     judgements = judge_all(results)
     rows = [row for row in _all_rows(results) if results.samples(row)]
     blocks: list[Block] = [Heading(_title(results), 1), Text(_summary(results, judgements, rows))]
-    if results.study.size.short:
+    if results.study.size.short is not None:
         blocks.append(
             Text(
                 "**Quick study: runs of a few updates and few seeds. It shows that everything works, not what holds.**"

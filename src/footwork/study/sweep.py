@@ -16,14 +16,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 from footwork.record import RunError
 from footwork.study.job import STOPPED, completed
-from footwork.study.plan import Job, Study
+from footwork.study.plan import Job, Size, Study
 from footwork.study.runs import run_path
 from footwork.train import planned_steps
 
@@ -177,8 +177,12 @@ def steps_of(study: Study, job: Job) -> int:
 
 def job_command(study: Study, job: Job, core: int | None) -> list[str]:
     """What starts a run."""
-    asked = {"runs": str(study.runs), "size": study.size.name, "row": job.row, "seed": job.seed, "core": core}
+    asked = {**_as_json(study), "row": job.row, "seed": job.seed, "core": core}
     return [sys.executable, "-m", "footwork.study.job", json.dumps(asked)]
+
+
+def _as_json(study: Study) -> dict[str, Any]:
+    return {"runs": str(study.runs.resolve()), "size": asdict(study.size)}
 
 
 def job_environment(base: Mapping[str, str], cache: Path) -> dict[str, str]:
@@ -380,8 +384,8 @@ def _run_on_ray(board: Board, workers: int, address: str, log: Callable[[str], N
         if job in board.done:
             continue
         before = references.get((job.needs or "", job.seed))
-        study = {"runs": str(board.study.runs.resolve()), "size": board.study.size.name}
-        reference = remote.options(name=job.name).remote(study, job.row, job.seed, job.steps, job.needs, before)
+        task = remote.options(name=job.name)
+        reference = task.remote(_as_json(board.study), job.row, job.seed, job.steps, job.needs, before)
         references[job.row, job.seed] = reference
         by_reference[reference] = job
         board.active.add(job)
@@ -426,14 +430,12 @@ def _connect(address: str) -> Any:
 
 
 def run_job(
-    study: Mapping[str, str], row: str, seed: int, steps: int, needs: str | None, before: Any
+    study: Mapping[str, Any], row: str, seed: int, steps: int, needs: str | None, before: Any
 ) -> tuple[int, float]:
     """A run's process on a node of the cluster; its exit status and seconds. ``before`` is only waited for."""
-    from footwork.study.plan import SIZES
-
     begun = time.monotonic()
     job = Job(row, seed, needs, steps)
-    here = Study(Path(study["runs"]), SIZES[study["size"]])
+    here = Study(Path(study["runs"]), Size.from_json(study["size"]))
     cache = Path(tempfile.gettempdir()) / f"footwork-cache-{os.getuid()}"  # of this node: others may have another CPU
     worker = _start(here, job, None, cache)
     try:

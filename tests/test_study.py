@@ -367,6 +367,8 @@ def test_answers_name_claims_and_figures_that_exist():
     ("arguments", "message"),
     [
         (["figures", "nope"], "unknown figure 'nope'; known figures: 01-walker, "),
+        (["figures", "--runs", ".", "--under", "feather"], "there are no rows under 'feather'"),
+        (["figures", "--runs", ".", "--under", "light"], "no finished runs under 'light'"),
         (["figures", "--runs", "nowhere"], "there is no folder of runs at nowhere"),
         (["report", "--runs", "nowhere"], "there is no folder of runs at nowhere"),
         (["reproduce", "--rows", "maze/none"], "no row matches 'maze/none'"),

@@ -110,6 +110,7 @@ class Figures:
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     runs: Path = Path("runs")  # where runs are kept, or results/ of a report
     to: Path = Path("figures")
+    under: str = ""  # another engine or ant, such as light: the same figures of the rows under it
     any_length: bool = False  # let runs of another length than their row's count too
 
 
@@ -277,7 +278,7 @@ def _reproduce(command: Reproduce, rest: list[str]) -> int:
 def _figures(command: Figures, rest: list[str]) -> int:
     from footwork.doors import study
 
-    return study.figures(command.names, command.runs, command.to, command.any_length)
+    return study.figures(command.names, command.runs, command.to, command.under, command.any_length)
 
 
 def _report(command: Report, rest: list[str]) -> int:

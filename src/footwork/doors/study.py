@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from footwork.doors import tables
 from footwork.record import RunError
 from footwork.study.claims import judge_all, rows_read
-from footwork.study.experiments import match_rows
+from footwork.study.experiments import is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
 from footwork.study.plan import FULL, QUICK, Study, default_rows, mark, plan, read_mark
 from footwork.study.report import write_report
@@ -47,11 +47,17 @@ def _line(command: Reproduce) -> str:
     return " ".join(parts)
 
 
-def figures(names: tuple[str, ...], runs: Path, to: Path, any_length: bool) -> int:
+def figures(names: tuple[str, ...], runs: Path, to: Path, under: str, any_length: bool) -> int:
     """Draw figures, and say of each what it lacks."""
     chosen = find_figures(names)
     results = _results(runs, any_length)
-    for drawn in draw_figures(results, chosen, to):
+    prefix = f"{under.strip('/')}/" if under else ""
+    if prefix and not is_row(f"{prefix}walker/plain"):
+        raise ValueError(f"there are no rows under {under!r}: there is no {prefix}walker/plain")
+    every = draw_figures(results, chosen, to, prefix)
+    if not every:
+        raise RunError(f"no finished runs under {under!r} of which there are figures in {runs}")
+    for drawn in every:
         lacks = f"; no finished runs of {', '.join(drawn.without)}" if drawn.without else ""
         _say(f"wrote {drawn.files[0]} and {drawn.files[1].name}{lacks}")
     _say_problems(results)

@@ -29,7 +29,7 @@ from typing import Literal
 
 import numpy as np
 
-from footwork.study.experiments import MAIN, find_row
+from footwork.study.experiments import MAIN, find_row, is_row
 from footwork.study.results import METRICS, Results
 from footwork.study.statistics import (
     Effect,
@@ -343,7 +343,7 @@ def settings_of(claim: Claim, prefixes: Iterable[str] = ("",)) -> list[Setting]:
     schedules = SCHEDULES if any("{" in row for row in rows) else {"paper": ""}
     chosen = tuple(prefixes) if claim.everywhere else ("",)
     settings = [Setting(prefix, schedule) for prefix in chosen for schedule in schedules]
-    return [setting for setting in settings if all(_known(setting.fill(row)) for row in rows)]
+    return [setting for setting in settings if all(is_row(setting.fill(row)) for row in rows)]
 
 
 def rows_read(prefixes: Iterable[str] = ("",)) -> list[str]:
@@ -366,17 +366,9 @@ def prefixes_at_hand(results: Results) -> tuple[str, ...]:
     found = []
     for path in places:
         prefix = f"{path.parent.name}/"
-        if any(_known(prefix + row) for row in MAIN):
+        if any(is_row(prefix + row) for row in MAIN):
             found.append(prefix)
     return ("", *found)
-
-
-def _known(row: str) -> bool:
-    try:
-        find_row(row)
-    except ValueError:
-        return False
-    return True
 
 
 def judge_all(results: Results) -> list[Judgement]:
@@ -401,7 +393,7 @@ def _overall(verdicts: list[Verdict]) -> Verdict:
 
 def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> Finding:
     rows = tuple(setting.fill(row) for row in what.rows)
-    scores = [results.scores(row, what.metric) if _known(row) else np.zeros(0) for row in rows]
+    scores = [results.scores(row, what.metric) if is_row(row) else np.zeros(0) for row in rows]
     seeds = tuple(len(score) for score in scores)
     if not all(seeds):
         return Finding(what, rows, seeds, None, None, "undecided", "undecided")

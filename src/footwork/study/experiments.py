@@ -215,6 +215,15 @@ def _of_robot(row: Experiment, robot: Robot) -> Experiment:
     return with_robot(moved, robot)
 
 
+def is_row(name: str) -> bool:
+    """Whether there is a row of that name."""
+    try:
+        find_row(name)
+    except ValueError:
+        return False
+    return True
+
+
 def with_robot(experiment: Experiment, robot: Robot) -> Experiment:
     """The row with another ant."""
     return replace(experiment, task=replace(experiment.task, robot=robot))

@@ -21,7 +21,7 @@ import numpy as np
 import footwork
 from footwork.checkpoint import write_atomically
 from footwork.study.claims import CLAIMS, Finding, Judgement, judge_all, prefixes_at_hand, rows_read, show_effect
-from footwork.study.experiments import EXPERIMENTS, find_row
+from footwork.study.experiments import EXPERIMENTS, find_row, is_row
 from footwork.study.figures import FIGURES, Drawn, draw_figures
 from footwork.study.measure import EVALUATION, TRANSITIONS
 from footwork.study.plan import STUDY_FILE, read_machine
@@ -117,7 +117,8 @@ def write_report(results: Results, to: Path, command: str) -> list[Path]:
     Raises:
         OSError: it cannot be written.
     """
-    drawn = draw_figures(results, FIGURES, to / "figures")
+    prefixes = prefixes_at_hand(results)
+    drawn = [one for prefix in prefixes for one in draw_figures(results, FIGURES, to / "figures", prefix)]
     blocks = report_blocks(results, drawn, command)
     pages = {"REPORT.md": _markdown(blocks, to), "report.html": _page(blocks, _title(results))}
     for name, text in pages.items():
@@ -175,16 +176,8 @@ def _summary(results: Results, judgements: Sequence[Judgement], rows: Sequence[s
 def _all_rows(results: Results) -> list[str]:
     """The table, and the same under every engine or ant at hand."""
     elsewhere = [prefix + row for prefix in prefixes_at_hand(results) if prefix for row in EXPERIMENTS]
-    known = [row for row in elsewhere if row not in EXPERIMENTS and _known(row)]
+    known = [row for row in elsewhere if row not in EXPERIMENTS and is_row(row)]
     return [*EXPERIMENTS, *known]
-
-
-def _known(row: str) -> bool:
-    try:
-        find_row(row)
-    except ValueError:
-        return False
-    return True
 
 
 def _claims_table(judgements: Sequence[Judgement]) -> TableBlock:
@@ -346,12 +339,14 @@ def _heading(drawn: Drawn) -> str:
     figure = drawn.figure
     number = figure.name.partition("-")[0].lstrip("0")
     paper = f" (the paper's {figure.paper})" if figure.paper else ""
-    return f"{number}. {figure.title}{paper}"
+    where = f", {drawn.prefix.strip('/')}" if drawn.prefix else ""
+    return f"{number}. {figure.title}{where}{paper}"
 
 
 def _caption(drawn: Drawn) -> str:
     without = f" Without finished runs: {', '.join(drawn.without)}." if drawn.without else ""
-    return f"{drawn.figure.caption}{without} Drawn by `footwork figures {drawn.figure.name}`."
+    under = f" --under {drawn.prefix.strip('/')}" if drawn.prefix else ""
+    return f"{drawn.figure.caption}{without} Drawn by `footwork figures {drawn.figure.name}{under}`."
 
 
 _STYLE = """

@@ -86,12 +86,12 @@ def task_curves(results: Results, rows: tuple[str, ...]) -> Any:
     figure, axes = panels(1, 2, 3.5, share_y=True)
     for ax, (schedule, mine) in zip(axes[0], kinds.items(), strict=True):
         drawn = [draw_row(ax, results, row, share_of_way) for row in mine]
-        if not any(drawn):
-            empty(ax, "no finished runs yet")
         ax.set_title(SCHEDULE_TITLES[schedule])
         ax.axhline(1.0, color="#999999", lw=0.8, ls=":")
         ax.set_xlabel("control steps")
         _plain_steps(ax)
+        if not any(drawn):
+            empty(ax, "no finished runs yet")
     axes[0, 0].set_ylabel("distance part of the reward\n(share of the whole way; 1: at the goal)")
     legend_below(figure, axes[0])
     return figure
@@ -113,11 +113,11 @@ def direction_curves(results: Results, rows: tuple[str, ...]) -> Any:
                 ys = [curve.values["return"][:, i] for _, curve in curves]
                 line = ("-", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1)))[i]
                 draw_curve(ax, xs, ys, f"{row} {direction}", DIRECTION_COLOURS[i], line, direction)
-        if not curves:
-            empty(ax, "no finished runs yet")
         ax.set_title(f"{row}\n{_count(len(curves))}")
         ax.set_xlabel("control steps per direction")
         _plain_steps(ax)
+        if not curves:
+            empty(ax, "no finished runs yet")
     for ax in axes[:, 0]:
         ax.set_ylabel("training reward per episode")
     legend_below(figure, list(axes.flat))
@@ -129,13 +129,13 @@ def success_curves(results: Results, rows: tuple[str, ...]) -> Any:
     figure, axes = panels(2, 2, 2.7, share_y=True)
     for line, place in zip(axes, ("bandit", "maze"), strict=True):
         for ax, x in zip(line, ("step", "minutes"), strict=True):
-            drawn = [draw_row(ax, results, row, success, x) for row in rows if row.startswith(f"{place}/")]
-            if not any(drawn):
-                empty(ax, "no finished runs yet")
+            drawn = [draw_row(ax, results, row, success, x) for row in rows if f"/{place}/" in f"/{row}"]
             ax.set_xscale("symlog", linthresh=20_000 if x == "step" else 0.2)
             ax.set_title(f"Ant{place.capitalize()}")
-            ax.set_xlabel("control steps" if x == "step" else "minutes of training on one core")
+            ax.set_xlabel("control steps" if x == "step" else "minutes of training")
             ax.set_ylim(-0.03, 1.03)
+            if not any(drawn):
+                empty(ax, "no finished runs yet")
         line[0].set_ylabel("episodes that end in the goal")
     legend_below(figure, list(axes.flat))
     return figure

@@ -92,14 +92,12 @@ def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, .
             x = values if all(isinstance(v, int | float) for v in values) else list(range(len(values)))
             if values:
                 interval_marks(ax, x, effects, Look("#0072B2", "-", "o"), grid.name)
-            else:
-                empty(ax, "no finished\nruns yet")
             if x is values and values:
                 ax.set_xscale("log")
-                ax.set_xticks(x, [str(v) for v in values])
-                ax.minorticks_off()
-            else:
-                ax.set_xticks(x, [str(v) for v in values])
+            ax.set_xticks(x, [str(v) for v in values])
+            ax.minorticks_off()
+            if not values:
+                empty(ax, "no finished\nruns yet")
             if METRICS[metric].percent:
                 ax.set_ylim(-0.05, 1.05)
             ax.set_title(grid.name.removeprefix("ablation/"))
@@ -169,7 +167,7 @@ def profiles(results: Results, rows: tuple[str, ...]) -> Any:
     thresholds = np.linspace(0.0, 1.0, 201)
     for ax, place in zip(axes[0], ("bandit", "maze"), strict=True):
         for row in rows:
-            if row.startswith(f"{place}/") and len(scores := results.scores(row, "way")):
+            if f"/{place}/" in f"/{row}" and len(scores := results.scores(row, "way")):
                 look = look_of(row)
                 profile = performance_profile(scores, thresholds)
                 ax.step(thresholds, profile, color=look.colour, ls=look.line, lw=1.5, label=label_of(row), where="post")

@@ -84,7 +84,7 @@ def panels(
 def save(figure: Any, path: Path, note: str = "") -> list[Path]:
     """Write PNG and SVG beside each other; a note (of a small study) stands on the figure itself."""
     if note:
-        figure.text(0.995, 0.995, note, ha="right", va="top", fontsize=8, color="#B00020", weight="bold")
+        figure.text(1.0, 1.015, note, ha="right", va="bottom", fontsize=8, color="#B00020", weight="bold")
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
     figure.savefig(png, dpi=DPI, bbox_inches="tight", metadata={"Software": None})
@@ -105,6 +105,7 @@ def legend_below(figure: Any, axes: Sequence[Any], columns: int = 4) -> None:
 
 def empty(ax: Any, what: str) -> None:
     """Say on the axes themselves that there is nothing to draw yet."""
+    ax.set_xticks([])
     ax.text(0.5, 0.5, what, transform=ax.transAxes, ha="center", va="center", color="#888888", wrap=True)
 
 

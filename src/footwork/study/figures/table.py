@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from footwork.study.experiments import is_row
 from footwork.study.figures import curves, measures, paths, scenes
 from footwork.study.figures.style import save, styled
 from footwork.study.results import Results
@@ -43,6 +44,7 @@ class Drawn(NamedTuple):
     figure: Figure
     files: tuple[Path, ...]
     without: tuple[str, ...]  # rows that it reads and that have no finished runs
+    prefix: str = ""  # of its rows: another engine or ant
 
 
 def _against_flat(place: str) -> tuple[str, ...]:
@@ -239,15 +241,22 @@ def find_figures(names: Iterable[str]) -> list[Figure]:
     return chosen or list(FIGURES)
 
 
-def draw_figures(results: Results, figures: Iterable[Figure], to: Path) -> list[Drawn]:
-    """Draw figures into a folder, each as PNG and as SVG."""
+def draw_figures(results: Results, figures: Iterable[Figure], to: Path, prefix: str = "") -> list[Drawn]:
+    """Draw figures into a folder, each as PNG and as SVG.
+
+    With a prefix such as ``light/``, the same of the rows under it, into a folder of that name: results of
+    different engines and ants stay apart. Figures of which there is nothing under it are left out.
+    """
     note = "" if results.study.size.name == "full" else f"{results.study.size.name} study: short runs, few seeds"
-    if results.any_length:
-        note = "runs of any length"
+    note = "runs of any length" if results.any_length else note
+    note = " - ".join(part for part in (prefix.strip("/"), note) if part)
     drawn = []
     for figure in figures:
-        without = tuple(row for row in figure.rows if not results.samples(row))
+        rows = tuple(prefix + row for row in figure.rows if is_row(prefix + row))
+        without = tuple(row for row in rows if not results.samples(row))
+        if prefix and len(without) == len(rows):
+            continue
         with styled():
-            files = save(figure.draw(results, figure.rows), to / figure.name, note)
-        drawn.append(Drawn(figure, tuple(files), without))
+            files = save(figure.draw(results, rows), to / prefix / figure.name, note)
+        drawn.append(Drawn(figure, tuple(files), without, prefix))
     return drawn

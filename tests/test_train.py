@@ -271,9 +271,9 @@ def test_an_unfinished_run_is_no_address(tmp_path):
 
 
 def test_unknown_and_untrained_rows_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"unknown row 'walker/fast'; known rows: walker/plain, ") as caught:
+    with pytest.raises(ValueError, match=r"unknown row 'walker/fast'; known rows: walker/{plain, ") as caught:
         find_trained("walker/fast", tmp_path)
-    assert all(row in str(caught.value) for row in EXPERIMENTS)
+    assert all(part in str(caught.value) for row in EXPERIMENTS for part in row.rsplit("/", 1))
     assert "\n" not in str(caught.value)
 
 

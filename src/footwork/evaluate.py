@@ -28,6 +28,7 @@ SWITCHING_STEPS = 2000  # control steps of random switching
 SWITCHING_PERIODS = (25, 50, 100, 200)  # control steps per option
 HANDOVER_AFTER = (100, 200)  # control steps of the first policy, uniform in this range in multiples of the segment
 HANDOVER_STEPS = 300  # control steps of the second
+HANDOVER_SPEED = 0.5  # m/s along the second, over all its steps, from which a hand-over counts as a success
 _SEGMENT = 25  # control steps between two looks
 _NUM_DIRECTIONS = len(DIRECTIONS)
 _UNIT = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)  # of the directions, world frame
@@ -283,6 +284,7 @@ def handover_matrix(
     """Run i for 100 to 200 control steps, then j for 300: entry [i][j] has fall and flip rate and the speed after.
 
     ``ants`` per pair. A fall or flip counts from the hand-over on; the speed is along j over all 300 steps.
+    A hand-over succeeds without either at :data:`HANDOVER_SPEED` or more.
     """
     pairs = np.repeat(np.arange(_NUM_DIRECTIONS**2, dtype=np.int32), ants)
     first, second = pairs // _NUM_DIRECTIONS, pairs % _NUM_DIRECTIONS
@@ -302,12 +304,13 @@ def handover_matrix(
             at_end = np.where(np.equal(segment, switch + after - 1)[:, None], _positions(state), at_end)
     seconds = HANDOVER_STEPS * task.robot.control_dt
     speed = np.sum((at_end - at_switch) * _UNIT[second], axis=1) / seconds
-    by_pair = [array.reshape(_NUM_DIRECTIONS, _NUM_DIRECTIONS, ants).mean(axis=2) for array in (fell, flipped, speed)]
+    success = ~fell & ~flipped & (speed >= HANDOVER_SPEED)
+    counted_as = {"fall": fell, "flip": flipped, "speed_mps": speed, "success": success}
+    by_pair = {
+        name: array.reshape(_NUM_DIRECTIONS, _NUM_DIRECTIONS, ants).mean(2) for name, array in counted_as.items()
+    }
     return [
-        [
-            {"fall": float(by_pair[0][i, j]), "flip": float(by_pair[1][i, j]), "speed_mps": float(by_pair[2][i, j])}
-            for j in range(_NUM_DIRECTIONS)
-        ]
+        [{name: float(rates[i, j]) for name, rates in by_pair.items()} for j in range(_NUM_DIRECTIONS)]
         for i in range(_NUM_DIRECTIONS)
     ]
 

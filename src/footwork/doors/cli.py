@@ -1,4 +1,4 @@
-"""The command line: ``footwork list | train | evaluate | transitions | quickstart | bench``.
+"""The command line: ``footwork --help`` lists the commands.
 
 Only what a command needs is imported, and only once it is known which command it is:
 ``footwork --help`` answers at once.
@@ -29,6 +29,7 @@ class List:
     """Show the table: every row that can be trained."""
 
     runs: Path = Path("runs")  # where runs are kept
+    all: bool = False  # a line for every row of an ablation too
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,44 @@ class Bench:
     rivals_python: str | None = None  # an interpreter that has the other libraries; default: this one
 
 
+@dataclass(frozen=True)
+class Reproduce:
+    """Run the whole study, every run on a core of its own, and write the report; called again, it goes on.
+
+    A finished run is not run again, a killed one continues. Seed i of a master stands on seed i of its sub-policies.
+    """
+
+    runs: Path | None = None  # where runs are kept; default: runs, or runs-quick
+    to: Path | None = None  # where the report goes; default: report, or report-quick
+    rows: tuple[str, ...] = ()  # addresses or patterns such as 'maze/*'; default: the whole table
+    seeds: int | None = None  # of every row; default: 10 where a claim reads the row, else 3
+    quick: bool = False  # the same in small: runs of a few updates, few seeds, the ends of each ablation
+    workers: int = 0  # runs at once; 0: one per core
+    launcher: str = "local"  # or ray (extra footwork[ray]): the same runs on a cluster that shares the folder
+    address: str = "auto"  # of the Ray cluster
+    plan: bool = False  # show what would be run, and stop
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Draw figures of the study, from files alone: all, or those that are named (5, or 05-maze-reward)."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    runs: Path = Path("runs")  # where runs are kept, or results/ of a report
+    to: Path = Path("figures")
+    under: str = ""  # another engine or ant, such as light: the same figures of the rows under it
+    any_length: bool = False  # let runs of another length than their row's count too
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write the report of the runs that are there: claims, figures, rows, and what was left out."""
+
+    runs: Path = Path("runs")  # where runs are kept, or results/ of a report
+    to: Path = Path("report")
+    any_length: bool = False  # let runs of another length than their row's count too
+
+
 def main() -> None:
     """The entry point."""
     keep_compiled()
@@ -138,7 +177,7 @@ def _processor() -> str:
 
 def run(arguments: list[str]) -> int:
     """Run one command; what a user can mend is one line on stderr and exit status 1, 130 for an interrupt."""
-    commands: Any = List | Train | Evaluate | Transitions | Quickstart | Bench
+    commands: Any = List | Train | Evaluate | Transitions | Quickstart | Bench | Reproduce | Figures | Report
     chosen, rest = tyro.cli(commands, args=arguments, prog="footwork", return_unknown_args=True)
     if rest and not isinstance(chosen, Train):
         print(f"footwork: unknown options: {' '.join(rest)}; see footwork {arguments[0]} --help", file=sys.stderr)
@@ -150,6 +189,9 @@ def run(arguments: list[str]) -> int:
         Transitions: _transitions,
         Quickstart: _quickstart,
         Bench: _bench,
+        Reproduce: _reproduce,
+        Figures: _figures,
+        Report: _report,
     }
     try:
         return actions[type(chosen)](chosen, rest)
@@ -163,13 +205,14 @@ def run(arguments: list[str]) -> int:
         if not _is_for_the_user(error):
             raise
         print(f"footwork: {error}", file=sys.stderr)
-        return 130 if type(error).__name__ == "Interrupted" else 1
+        return 130 if type(error).__name__ in ("Interrupted", "SweepStopped") else 1
 
 
 def _is_for_the_user(error: Exception) -> bool:
     from footwork.train import Interrupted, TrainingDiverged
 
-    return isinstance(error, ValueError | OSError | ImportError | Interrupted | TrainingDiverged)
+    stopped = isinstance(error, Interrupted | TrainingDiverged) or type(error).__name__ == "SweepStopped"
+    return stopped or isinstance(error, ValueError | OSError | ImportError)
 
 
 def _list(command: List, rest: list[str]) -> int:
@@ -182,7 +225,7 @@ def _list(command: List, rest: list[str]) -> int:
     runs = {name: len(finished_runs(name, command.runs)) for name in (*EXPERIMENTS, *elsewhere)}
     rows = [find_row(name) for name in runs if name in EXPERIMENTS or runs[name]]
     found = {row: f"{n} runs" if n else "packaged" if packaged(row).is_file() else "" for row, n in runs.items()}
-    tables.show(tables.rows_table(rows, found))
+    tables.show(tables.rows_table(rows, found, command.all))
     return 0
 
 
@@ -310,6 +353,24 @@ def _bench(command: Bench, rest: list[str]) -> int:
 
         print(f"wrote {bench_figure(command.to / 'bench.png', report)}", file=sys.stderr)
     return 0 if work.complete else 130
+
+
+def _reproduce(command: Reproduce, rest: list[str]) -> int:
+    from footwork.doors import study
+
+    return study.reproduce(command)
+
+
+def _figures(command: Figures, rest: list[str]) -> int:
+    from footwork.doors import study
+
+    return study.figures(command.names, command.runs, command.to, command.under, command.any_length)
+
+
+def _report(command: Report, rest: list[str]) -> int:
+    from footwork.doors import study
+
+    return study.report(command.runs, command.to, command.any_length)
 
 
 def _at_least_one(name: str, value: int) -> None:

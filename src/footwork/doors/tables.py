@@ -9,6 +9,9 @@ from rich.table import Table
 
 from footwork.arena import DIRECTIONS
 from footwork.physics import DEFAULT_ENGINE, ENGINES
+from footwork.study.claims import Judgement
+from footwork.study.experiments import group_of
+from footwork.study.plan import Job
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment
 
@@ -22,23 +25,75 @@ def show(*tables: Table) -> None:
         console.print(table)
 
 
-def rows_table(experiments: list[Experiment], found: dict[str, str]) -> Table:
-    """What each row trains, on what, and whether trained policies are at hand."""
-    table = Table(title="rows", title_justify="left")
+def rows_table(experiments: list[Experiment], found: dict[str, str], every_row: bool = False) -> Table:
+    """What each row trains, on what, and whether trained policies are at hand; variations in short."""
+    title = "rows" if every_row else "rows (variations in short: --all shows them)"
+    table = Table(title=title, title_justify="left")
     for column in ("row", "trains", "task", "needs", "S", "k", "control steps", "trained"):
         table.add_column(column, justify="right" if column in ("S", "k", "control steps") else "left", no_wrap=True)
+    groups: dict[str, list[Experiment]] = {}
     for row in experiments:
-        kind = "master" if row.is_master else "sub-policies" if row.is_walker else "flat policy"
-        table.add_row(
-            row.name,
-            kind,
-            row.task.name,
-            row.needs or "",
-            str(row.ppo.batch_size),
-            str(row.option_steps) if row.is_master else "",
-            f"{row.total_steps:,}" + (" x 4" if row.runs_per_seed > 1 else ""),
-            found[row.name],
-        )
+        groups.setdefault(group_of(row.name), []).append(row)
+    last = ""
+    for group, rows in groups.items():
+        short = not every_row and _in_one_line(group)
+        section = group.partition("/")[0] if short and not group.endswith("-penalised") else group
+        if last and section != last:
+            table.add_section()
+        last = section
+        if short and len(rows) > 1:
+            values = ", ".join(row.name.rpartition("/")[2] for row in rows)
+            name = f"{group}/{{{values}}}" if len(values) < 24 else f"{group}/... ({len(rows)})"
+            trained = sum(bool(found[row.name]) for row in rows)
+            cells = _row_cells(rows[0], name, f"{trained} of {len(rows)}" if trained else "")
+            table.add_row(*_where_they_agree(cells, [_row_cells(row, "", "") for row in rows]))
+            continue
+        for row in rows:
+            table.add_row(*_row_cells(row, row.name, found[row.name]))
+    return table
+
+
+def _in_one_line(group: str) -> bool:
+    """Whether a group is a variation of others, and listed in short."""
+    return group.partition("/")[0] in ("ablation", "light") or group.endswith("-penalised")
+
+
+def _where_they_agree(cells: tuple[str, ...], others: list[tuple[str, ...]]) -> tuple[str, ...]:
+    """Cells of a line that stands for several rows: dots where the rows differ; its name and what is trained stay."""
+    same = [len({other[i] for other in others}) == 1 for i in range(len(cells))]
+    return tuple(
+        cell if agree or i in (0, len(cells) - 1) else "..."
+        for i, (cell, agree) in enumerate(zip(cells, same, strict=True))
+    )
+
+
+def _row_cells(row: Experiment, name: str, found: str) -> tuple[str, ...]:
+    """One line of the table of rows."""
+    kind = "master" if row.is_master else "sub-policies" if row.is_walker else "flat policy"
+    k = str(row.option_steps) if row.is_master else ""
+    steps = f"{row.total_steps:,}" + (" x 4" if row.runs_per_seed > 1 else "")
+    return name, kind, row.task.name, row.needs or "", str(row.ppo.batch_size), k, steps, found
+
+
+def plan_table(jobs: list[Job], size: str) -> Table:
+    """What a study would run: seeds and control steps of each row."""
+    total = sum(job.steps for job in jobs)
+    table = Table(title=f"{size} study: {len(jobs)} runs, {total:,} control steps", title_justify="left")
+    for column in ("row", "seeds", "control steps"):
+        table.add_column(column, justify="left" if column == "row" else "right", no_wrap=True)
+    for row in dict.fromkeys(job.row for job in jobs):
+        mine = [job for job in jobs if job.row == row]
+        table.add_row(row, str(len(mine)), f"{sum(job.steps for job in mine):,}")
+    return table
+
+
+def claims_table(judgements: list[Judgement], size: str) -> Table:
+    """Verdicts, one line per claim and setting."""
+    table = Table(title="claims" if size == "full" else f"claims ({size} study)", title_justify="left")
+    for column in ("", "claim", "where", "verdict", "because"):
+        table.add_column(column, justify="right" if column == "" else "left")
+    for j in judgements:
+        table.add_row(str(j.claim.number), j.claim.words, j.where, j.verdict, j.why)
     return table
 
 

@@ -3,18 +3,22 @@
 Rows are data. Training, evaluation, packaged weights and smoke tests are derived from
 :data:`EXPERIMENTS`; Table 1 of the paper stands once, in ``footwork.learn.config.PAPER``.
 Every row exists on every engine: ``bullet/walker/plain`` is ``walker/plain`` on PyBullet.
+Ablations are grids (:data:`GRIDS`): one line here is as many rows as it has values.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 from footwork.arena import MAZES, Arena, bandit, maze, open_field
 from footwork.learn.config import PAPER, PPOConfig
 from footwork.physics import DEFAULT_ENGINE, ENGINES, check_engine
 from footwork.regularisers import AppropriateBias, Interleaved, RandomRepeated, RandomStart
-from footwork.robot import HEAVY, Robot
+from footwork.robot import HEAVY, ROBOTS, Robot
 from footwork.tasks.task import Task
 from footwork.tasks.terms import FREE_WEIGHTS, PENALISED_WEIGHTS, WALKER_WEIGHTS
 from footwork.train import Experiment
@@ -87,6 +91,11 @@ def _guided(task: Task) -> Task:
     return replace(task, weights=replace(task.weights, goal=200.0), xy_scale=0.125)
 
 
+def _penalised(task: Task) -> Task:
+    """With the stability penalties in the reward, whatever else is in it."""
+    return replace(task, weights=replace(PENALISED_WEIGHTS, goal=task.weights.goal))
+
+
 def _masters(task: Task, kind: str, ppo: PPOConfig, total_steps: int) -> list[Experiment]:
     """A master on each kind of sub-policies."""
     place = task.name.removeprefix("Ant").lower()
@@ -98,27 +107,179 @@ def _masters(task: Task, kind: str, ppo: PPOConfig, total_steps: int) -> list[Ex
     ]
 
 
-def _flat(task: Task) -> list[Experiment]:
+def _flat(task: Task, kind: str = "") -> list[Experiment]:
     """One policy for everything, with and without stability penalties (paper, section 5)."""
     place = task.name.removeprefix("Ant").lower()
     return [
-        Experiment(f"{place}/flat/penalised", replace(task, weights=PENALISED_WEIGHTS), PAPER, FLAT_STEPS),
-        Experiment(f"{place}/flat/free", task, PAPER, FLAT_STEPS),
+        Experiment(f"{place}/flat/{kind}penalised", _penalised(task), PAPER, FLAT_STEPS),
+        Experiment(f"{place}/flat/{kind}free", task, PAPER, FLAT_STEPS),
     ]
 
 
-EXPERIMENTS: dict[str, Experiment] = {
+GUIDED_BANDIT = _guided(ANT_BANDIT)
+GUIDED_MAZE = replace(_guided(ANT_MAZE), potential="geodesic")
+
+
+def _study_of(paper: Task, guided: Task, total_steps: int) -> tuple[Experiment, ...]:
+    """All rows of a task: the paper's reward and schedule, and ours; flat policies with either reward."""
+    paper_ppo = PAPER_MASTER_MAZE if paper.name == "AntMaze" else PAPER_MASTER_BANDIT
+    return (
+        *_masters(guided, "hrl", MASTER_PPO, total_steps),
+        *_masters(_penalised(guided), "hrl-penalised", MASTER_PPO, total_steps),
+        *_masters(paper, "paper", paper_ppo, total_steps),
+        *_masters(_penalised(paper), "paper-penalised", paper_ppo, total_steps),
+        *_flat(paper),
+        *_flat(guided, "guided-"),
+    )
+
+
+MAIN: dict[str, Experiment] = {
     row.name: row
     for row in (
         *WALKERS,
-        *_masters(_guided(ANT_BANDIT), "hrl", MASTER_PPO, 500_000),
-        *_masters(replace(_guided(ANT_MAZE), potential="geodesic"), "hrl", MASTER_PPO, 2_000_000),
-        *_masters(ANT_BANDIT, "paper", PAPER_MASTER_BANDIT, 500_000),
-        *_masters(ANT_MAZE, "paper", PAPER_MASTER_MAZE, 2_000_000),
-        *_flat(ANT_BANDIT),
-        *_flat(ANT_MAZE),
+        *_study_of(ANT_BANDIT, GUIDED_BANDIT, 500_000),
+        *_study_of(ANT_MAZE, GUIDED_MAZE, 2_000_000),
     )
 }
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Rows that differ from a row in one field: ``NAME/VALUE`` for each value.
+
+    Args:
+        name: the rows' common address.
+        base: the row that they vary; its own value is a point of the grid too.
+        field: of the row, with dots into what it holds, e.g. ``regulariser.steps``.
+        values: of the field.
+        words: what the field is, for axes and tables.
+    """
+
+    name: str
+    base: str
+    field: str
+    values: tuple[Any, ...]
+    words: str
+
+    def rows(self) -> list[Experiment]:
+        """The rows, in the order of the values."""
+        base = MAIN[self.base]
+        return [replace(_with_field(base, self.field, value), name=f"{self.name}/{value}") for value in self.values]
+
+    def points(self) -> dict[Any, str]:
+        """Row by value, the base's among them, in rising order where the values are numbers."""
+        points = {value: f"{self.name}/{value}" for value in self.values}
+        own: Any = MAIN[self.base]
+        for part in self.field.split("."):
+            own = getattr(own, part)
+        points.setdefault(own, self.base)
+        numbers = all(isinstance(value, int | float) for value in points)
+        return dict(sorted(points.items())) if numbers else points
+
+
+def _with_field(config: Any, field: str, value: Any) -> Any:
+    """A dataclass with one field, possibly of something inside it, replaced."""
+    first, _, rest = field.partition(".")
+    return replace(config, **{first: _with_field(getattr(config, first), rest, value) if rest else value})
+
+
+# The paper names neither k nor any t; its B = 32 is a number of batches here, and a size below.
+GRIDS: tuple[Grid, ...] = (
+    Grid("ablation/bandit/k", "bandit/hrl/interleaved", "option_steps", (10, 20, 100, 200, 400), "k (control steps)"),
+    Grid("ablation/maze/k", "maze/hrl/interleaved", "option_steps", (10, 20, 100, 200, 400), "k (control steps)"),
+    Grid("ablation/maze/k-paper", "maze/paper/interleaved", "option_steps", (100, 200, 400), "k (control steps)"),
+    Grid("ablation/random-start/t", "walker/random-start", "regulariser.steps", (10, 25, 100, 200), "t"),
+    Grid("ablation/random-repeated/t", "walker/random-repeated", "regulariser.every", (25, 50, 200, 400), "t"),
+    Grid("ablation/appropriate-bias/t", "walker/appropriate-bias", "regulariser.steps", (25, 50, 200, 400), "t"),
+    Grid("ablation/interleaved/t", "walker/interleaved", "regulariser.mean_steps", (16, 80, 160, 320), "mean stay"),
+    Grid("ablation/walker/B-as-size", "walker/plain", "ppo.minibatch_size", (32,), "B as a size"),
+    Grid("ablation/bandit/B-as-size", "bandit/paper/interleaved", "ppo.minibatch_size", (32,), "B as a size"),
+    Grid("ablation/maze/B-as-size", "maze/paper/interleaved", "ppo.minibatch_size", (32,), "B as a size"),
+    Grid("ablation/maze/potential", "maze/hrl/interleaved", "task.potential", ("straight",), "potential"),
+    Grid("ablation/maze/potential-paper", "maze/paper/interleaved", "task.potential", ("geodesic",), "potential"),
+)
+
+# Rows of the light ant: what claims 7 to 12 and 14 read.
+LIGHT_KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias", "interleaved")
+LIGHT: tuple[str, ...] = (
+    *(f"walker/{kind}" for kind in LIGHT_KINDS),
+    *(f"{place}/hrl/{kind}" for place in ("bandit", "maze") for kind in LIGHT_KINDS),
+)
+
+
+def _of_robot(row: Experiment, robot: Robot) -> Experiment:
+    """The row for another ant, with everything it stands on: a row of its own, addressed ``ROBOT/ROW``."""
+    regulariser = row.regulariser
+    if isinstance(regulariser, AppropriateBias):
+        regulariser = replace(regulariser, partners=f"{robot.name}/{regulariser.partners}")
+    needed = None if row.sub_policies is None else f"{robot.name}/{row.sub_policies}"
+    moved = replace(row, name=f"{robot.name}/{row.name}", regulariser=regulariser, sub_policies=needed)
+    return with_robot(moved, robot)
+
+
+def is_row(name: str) -> bool:
+    """Whether there is a row of that name."""
+    try:
+        find_row(name)
+    except ValueError:
+        return False
+    return True
+
+
+def with_robot(experiment: Experiment, robot: Robot) -> Experiment:
+    """The row with another ant."""
+    return replace(experiment, task=replace(experiment.task, robot=robot))
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    **MAIN,
+    **{row.name: row for grid in GRIDS for row in grid.rows()},
+    **{row.name: row for row in (_of_robot(MAIN[name], ROBOTS["light"]) for name in LIGHT)},
+}
+
+
+def group_of(name: str) -> str:
+    """What a row is listed under: all but the last part of its address."""
+    return name.rpartition("/")[0]
+
+
+def _all_rows() -> str:
+    """Every row's address, those of a group in braces."""
+    groups: dict[str, list[str]] = {}
+    for name in EXPERIMENTS:
+        groups.setdefault(group_of(name), []).append(name.rpartition("/")[2])
+    return ", ".join(f"{group}/{{{', '.join(names)}}}" for group, names in groups.items())
+
+
+def match_rows(patterns: Iterable[str]) -> list[str]:
+    """The rows that patterns such as ``maze/*`` or ``*/plain`` mean, in the order of the table; all for none.
+
+    A pattern may be a row's whole address, also of one that :func:`find_row` knows without the table.
+
+    Raises:
+        ValueError: a pattern matches no row; lists the groups there are.
+    """
+    chosen: dict[str, None] = {}
+    wanted = tuple(patterns)
+    for pattern in wanted:
+        found = _matching(pattern)
+        if not found:
+            groups = ", ".join(dict.fromkeys(f"{group_of(name)}/*" for name in EXPERIMENTS))
+            raise ValueError(f"no row matches {pattern!r}; known rows: {groups} (footwork list)")
+        chosen.update(dict.fromkeys(found))
+    return list(chosen) if wanted else list(EXPERIMENTS)
+
+
+def _matching(pattern: str) -> list[str]:
+    found = [name for name in EXPERIMENTS if fnmatchcase(name, pattern)]
+    if found:
+        return found
+    first, _, rest = pattern.partition("/")  # rows that stand in the table under another first part
+    found = [f"{first}/{name}" for name in EXPERIMENTS if rest and fnmatchcase(name, rest)]
+    try:
+        return [find_row(name).name for name in found]
+    except ValueError:
+        return []
 
 
 def find_row(name: str) -> Experiment:
@@ -131,13 +292,8 @@ def find_row(name: str) -> Experiment:
     if first in ENGINES and rest in EXPERIMENTS:
         return with_engine(EXPERIMENTS[rest], first)
     if name not in EXPERIMENTS:
-        raise ValueError(f"unknown row {name!r}; known rows: {', '.join(EXPERIMENTS)}")
+        raise ValueError(f"unknown row {name!r}; known rows: {_all_rows()}")
     return EXPERIMENTS[name]
-
-
-def with_robot(experiment: Experiment, robot: Robot) -> Experiment:
-    """The row with another ant."""
-    return replace(experiment, task=replace(experiment.task, robot=robot))
 
 
 def with_engine(row: Experiment, engine: str) -> Experiment:

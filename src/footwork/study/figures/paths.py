@@ -1,4 +1,4 @@
-"""Figures, drawn from results alone. Colours keep apart for the colour-blind and in print."""
+"""Paths and learning curves, drawn from results alone. Colours keep apart for the colour-blind and in print."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ from matplotlib.patches import Circle, Rectangle
 
 from footwork.arena import DIRECTIONS, Arena
 from footwork.evaluate import Episodes
+from footwork.study.experiments import find_row
+from footwork.study.figures.style import empty
+from footwork.study.measure import EVALUATION, STUCK_WITHIN, straight_line_stop
+from footwork.study.results import Results
 
 # Okabe and Ito's palette: right, up, left, down
 DIRECTION_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
@@ -35,6 +39,17 @@ def _draw_arena(axes: Any, arena: Arena, goal_radius: float | None) -> None:
     axes.autoscale_view()
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
+
+
+def _crop(axes: Any, arena: Arena, margin: float = 0.5) -> None:
+    """Show a maze without most of its border."""
+    if arena.grid:
+        inside_x = (len(arena.grid[0]) / 2 - 1) * arena.cell + margin
+        inside_y = (len(arena.grid) / 2 - 1) * arena.cell + margin
+        axes.set_xlim(-inside_x, inside_x)
+        axes.set_ylim(-inside_y, inside_y)
+    axes.grid(False)
+    axes.tick_params(labelsize=7)
 
 
 def draw_paths(axes: Any, arena: Arena, episodes: Episodes, goal_radius: float | None, most: int = 40) -> None:
@@ -70,7 +85,7 @@ def paths_figure(
     if note:
         figure.suptitle(note, fontsize=11)
     figure.tight_layout(rect=(0, 0.06, 1, 1))
-    return _write(figure, path)
+    return write(figure, path)
 
 
 def learning_curve(path: Path, metrics: list[dict[str, Any]], title: str) -> Path:
@@ -94,44 +109,60 @@ def learning_curve(path: Path, metrics: list[dict[str, Any]], title: str) -> Pat
         ax.grid(alpha=0.3)
     top.set_title(f"{title} (running mean over {window} updates)", fontsize=10)
     figure.tight_layout()
-    return _write(figure, path)
+    return write(figure, path)
 
 
-def bench_figure(path: Path, report: dict[str, Any]) -> Path:
-    """Every contestant's control steps per second, and how they change along each axis; written to ``path``."""
-    measured = {name: r["steps_per_second"] for name, r in report["contestants"].items() if "steps_per_second" in r}
-    figure = plt.figure(figsize=(12.5, max(4.5, 0.36 * len(measured) + 1.2)))
-    grid = figure.add_gridspec(2, 4, width_ratios=(2.4, 0.75, 1, 1))
-    bars = figure.add_subplot(grid[:, 0])
-    for height, (name, rate) in enumerate(reversed(measured.items())):
-        reach = [[rate["median"] - rate["low"]], [rate["high"] - rate["median"]]]
-        colour = FLAT_COLOUR if name.startswith(("sb3", "sbx")) else DIRECTION_COLOURS["physics" in name]
-        bars.barh(height, rate["median"], xerr=reach, color=colour, error_kw={"lw": 1})
-    bars.set_yticks(range(len(measured)), [*reversed(measured)], fontsize=8)
-    bars.set_xscale("log")
-    bars.set_xlabel("control steps per second (median, least, largest)")
-    bars.grid(axis="x", alpha=0.3)
-    for number, (axis, points) in enumerate(report["growth"].items()):
-        panel = figure.add_subplot(grid[number // 2, 2 + number % 2])
-        _draw_growth(panel, axis, [point for point in points if "skipped" not in point])
-    figure.tight_layout()
-    return _write(figure, path)
-
-
-def _draw_growth(axes: Any, name: str, points: list[dict[str, Any]]) -> None:
-    sizes = [point["size"] for point in points]
-    rates = [point["over_reference"]["median"] for point in points]
-    axes.plot(sizes, rates, marker="o", ms=4, color=DIRECTION_COLOURS[0])
-    axes.set_xscale("symlog", linthresh=1.0)
-    axes.set_xticks(sizes, [str(size) for size in sizes], fontsize=8)
-    axes.minorticks_off()
-    axes.set_ylim(bottom=0.0)
-    axes.set_title(f"steps/s over physics alone\n(one thread), by {name}", fontsize=9)
-    axes.grid(alpha=0.3)
-
-
-def _write(figure: Any, path: Path) -> Path:
+def write(figure: Any, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)
     return path
+
+
+def maze_paths(results: Results, rows: tuple[str, ...]) -> Any:
+    """Paths through the maze from above, those of a master coloured by sub-policy; of each row's first seed."""
+    columns = 3
+    lines = -(-len(rows) // columns)
+    figure, axes = plt.subplots(lines, columns, figsize=(7.2, 2.6 * lines), squeeze=False)
+    for ax, row in zip(axes.flat, rows, strict=False):
+        entry = next(iter(results.measurements(row, EVALUATION)), None)
+        if entry is None:
+            empty(ax, "no finished runs yet")
+        for path in [] if entry is None else entry["paths"]:
+            points = np.array(path["xy"])
+            if not path["choices"]:
+                ax.plot(points[:, 0], points[:, 1], color=FLAT_COLOUR, lw=0.9, alpha=0.75)
+                continue
+            segments = np.stack([points[:-1], points[1:]], axis=1)
+            colours = [DIRECTION_COLOURS[choice] for choice in path["choices"][: len(segments)]]
+            ax.add_collection(LineCollection(list(segments), colors=colours, linewidths=1.1, alpha=0.8))
+        _draw_arena(ax, find_row(row).task.arena, None)
+        _crop(ax, find_row(row).task.arena)
+        within = "" if entry is None else f"\n{100 * entry['success']['1.0']:.0f} % within 1 m"
+        ax.set_title(row + within, fontsize=8)
+    for ax in axes.flat[len(rows) :]:
+        ax.axis("off")
+    handles = [
+        Line2D([], [], color=colour, lw=2, label=f"sub-policy {direction}")
+        for direction, colour in zip(DIRECTIONS, DIRECTION_COLOURS, strict=True)
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def flat_ends(results: Results, rows: tuple[str, ...]) -> Any:
+    """Where the episodes of flat policies end, all seeds, and the place where the straight line meets the wall."""
+    figure, axes = plt.subplots(-(-len(rows) // 2), 2, figsize=(6.4, 5.8), squeeze=False)
+    for ax, row in zip(axes.flat, rows, strict=True):
+        arena, entries = find_row(row).task.arena, results.measurements(row, EVALUATION)
+        _draw_arena(ax, arena, None)
+        _crop(ax, arena)
+        for entry in entries:
+            ax.plot(*np.array(entry["ends"]).T, ".", ms=2.5, color="#0072B2", alpha=0.5, zorder=4, mew=0)
+        stop = straight_line_stop(arena)
+        if stop is not None:
+            ax.add_patch(Circle(stop, STUCK_WITHIN, fc="none", ec="#E69F00", lw=1.5, zorder=6))
+        share = np.mean([entry["stuck"] for entry in entries]) if entries else None
+        words = "no finished runs yet" if share is None else f"{100 * share:.0f} % in the circle, {len(entries)} seeds"
+        ax.set_title(f"{row.removeprefix('maze/')}\n{words}", fontsize=8)
+    return figure

@@ -1,0 +1,90 @@
+"""``footwork reproduce``, ``figures`` and ``report``: the study at the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from footwork.doors import tables
+from footwork.record import RunError
+from footwork.study.claims import judge_all, rows_read
+from footwork.study.experiments import is_row, match_rows
+from footwork.study.figures import draw_figures, find_figures
+from footwork.study.plan import FULL, QUICK, Study, default_rows, mark, plan, read_mark
+from footwork.study.report import write_report
+from footwork.study.results import Results
+from footwork.study.sweep import run_study
+
+if TYPE_CHECKING:
+    from footwork.doors.cli import Reproduce
+
+
+def reproduce(command: Reproduce) -> int:
+    """Run what is missing of the study, then write its report; 1 if a run failed."""
+    size = QUICK if command.quick else FULL
+    ending = "-quick" if command.quick else ""
+    study = Study(command.runs or Path(f"runs{ending}"), size)
+    read = rows_read()
+    rows = match_rows(command.rows) if command.rows else default_rows(size, read)
+    jobs = plan(study, rows, read, command.seeds)
+    if command.plan:
+        tables.show(tables.plan_table(jobs, size.name))
+        return 0
+    mark(study)
+    board = run_study(study, jobs, command.workers, command.launcher, command.address, log=_say)
+    status = report(study.runs, command.to or Path(f"report{ending}"), command=_line(command))
+    for job, reason in board.failed.items():
+        _say(f"{job.name}: FAILED: {reason}")
+    return 1 if board.failed else status
+
+
+def _line(command: Reproduce) -> str:
+    """The command line that asks for the same."""
+    parts = ["footwork reproduce"]
+    parts += ["--quick"] if command.quick else []
+    parts += ["--rows", *command.rows] if command.rows else []
+    parts += [f"--seeds {command.seeds}"] if command.seeds else []
+    return " ".join(parts)
+
+
+def figures(names: tuple[str, ...], runs: Path, to: Path, under: str, any_length: bool) -> int:
+    """Draw figures, and say of each what it lacks."""
+    chosen = find_figures(names)
+    results = _results(runs, any_length)
+    prefix = f"{under.strip('/')}/" if under else ""
+    if prefix and not is_row(f"{prefix}walker/plain"):
+        raise ValueError(f"there are no rows under {under!r}: there is no {prefix}walker/plain")
+    every = draw_figures(results, chosen, to, prefix)
+    if not every:
+        raise RunError(f"no finished runs under {under!r} of which there are figures in {runs}")
+    for drawn in every:
+        lacks = f"; no finished runs of {', '.join(drawn.without)}" if drawn.without else ""
+        _say(f"wrote {drawn.files[0]} and {drawn.files[1].name}{lacks}")
+    _say_problems(results)
+    return 0
+
+
+def report(runs: Path, to: Path, any_length: bool = False, command: str = "") -> int:
+    """Write the report, and show its claims."""
+    results = _results(runs, any_length)
+    pages = write_report(results, to, command or f"footwork report{' --any-length' if any_length else ''}")
+    tables.show(tables.claims_table(judge_all(results), results.study.size.name))
+    _say_problems(results)
+    for page in pages:
+        _say(f"wrote {page}")
+    return 0
+
+
+def _results(runs: Path, any_length: bool) -> Results:
+    if not runs.is_dir():
+        raise RunError(f"there is no folder of runs at {runs}")
+    return Results(Study(runs, read_mark(runs)), any_length)
+
+
+def _say_problems(results: Results) -> None:
+    for problem in results.problems:
+        _say(problem)
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

@@ -1,0 +1,476 @@
+"""The paper's claims and ours, written down before the runs: rows of data, and the rules that decide them.
+
+A claim compares rows of the table in a metric (:data:`footwork.study.results.METRICS`).
+Each comparison is a contrast of interquartile means over seeds with a 95 % stratified-bootstrap
+interval. Rules, where E is the estimate, [L, U] the interval and m the smallest difference that matters:
+
+==============  =========================  ================================
+rule            holds                      does not hold
+==============  =========================  ================================
+``greater``     L > 0 and E >= m           U < m
+``not worse``   L > -m                     U < 0 and E <= -m
+``same``        -m < L and U < m           0 outside [L, U] and |E| >= m
+``at least``    L >= threshold             U < threshold
+``at most``     U <= threshold             L > threshold
+==============  =========================  ================================
+
+Anything else is undecided, and so is every comparison with fewer than :attr:`Claim.min_seeds`
+seeds on a side. A claim holds if all its deciding comparisons hold; it does not hold if one does not.
+
+Rows are read per setting: engine and ant (the first part of an address), and the masters'
+reward and schedule, the paper's or ours. A verdict names all of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from footwork.study.experiments import MAIN, find_row, is_row
+from footwork.study.results import METRICS, Results
+from footwork.study.statistics import (
+    Effect,
+    Floats,
+    Statistic,
+    contrast,
+    generator_for,
+    overall_iqm,
+    probability_of_improvement,
+    spread,
+)
+
+Rule = Literal["greater", "not worse", "same", "at least", "at most"]
+Verdict = Literal["holds", "does not hold", "undecided"]
+MIN_SEEDS = 10
+PAPER_REGULARISERS = ("random-start", "random-repeated", "appropriate-bias")
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One comparison of a claim.
+
+    Args:
+        words: what is compared, short.
+        rows: addresses, with {schedule} and {guided} to be filled in.
+        weights: of each row's statistic.
+        metric: a key of METRICS.
+        rule: how it is decided.
+        bound: the smallest difference that matters, or the threshold of ``at least`` and ``at most``.
+        statistic: of each row's scores: the IQM, or the spread across seeds.
+        decides: otherwise it is only shown.
+    """
+
+    words: str
+    rows: tuple[str, ...]
+    weights: tuple[float, ...]
+    metric: str
+    rule: Rule
+    bound: float
+    statistic: Literal["iqm", "spread"] = "iqm"
+    decides: bool = True
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence, and what would have to be seen for it to hold.
+
+    Args:
+        number: as in the study's list.
+        words: the claim.
+        section: of the paper; "ours" for those that the paper does not make.
+        contrasts: its comparisons.
+        everywhere: it is judged on every engine and ant at hand, else on the default ones only.
+        min_seeds: on each side of a comparison, below which it is undecided.
+    """
+
+    number: int
+    words: str
+    section: str
+    contrasts: tuple[Contrast, ...]
+    everywhere: bool = False
+    min_seeds: int = MIN_SEEDS
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where a claim is judged: the first part of the addresses, and the masters' kind."""
+
+    prefix: str = ""  # "", "light/", "bullet/"
+    schedule: str = "paper"  # "paper" or "hrl"
+
+    def fill(self, row: str) -> str:
+        """The row's address in this setting."""
+        return self.prefix + row.format(schedule=self.schedule, guided="" if self.schedule == "paper" else "guided-")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a comparison found."""
+
+    contrast: Contrast
+    rows: tuple[str, ...]
+    seeds: tuple[int, ...]  # of each row
+    effect: Effect | None  # None where a row has no runs
+    probability: float | None  # of improvement, of two rows
+    verdict: Verdict
+    so_far: Verdict  # what the rule says if the number of seeds is not asked for
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A claim's verdict in a setting."""
+
+    claim: Claim
+    setting: Setting
+    where: str  # engine, ant, the masters' reward and schedule
+    findings: tuple[Finding, ...]
+    verdict: Verdict
+    why: str
+
+
+def _greater(words: str, one: str, other: str, metric: str, margin: float, decides: bool = True) -> Contrast:
+    return Contrast(words, (one, other), (1, -1), metric, "greater", margin, decides=decides)
+
+
+def _way(words: str, one: str, other: str, decides: bool = True) -> Contrast:
+    return _greater(words, one, other, "way", 0.05, decides)
+
+
+def _same_way(words: str, one: str, other: str, rule: Rule) -> Contrast:
+    return Contrast(words, (one, other), (1, -1), "way", rule, 0.05)
+
+
+def _success_too(contrasts: tuple[Contrast, ...]) -> tuple[Contrast, ...]:
+    """The same comparisons in success within 1 m, which the paper does not report: shown, not deciding."""
+    shown = (
+        Contrast(f"{c.words}, success", c.rows, c.weights, "success", c.rule, c.bound, c.statistic, decides=False)
+        for c in contrasts
+    )
+    return (*contrasts, *shown)
+
+
+def _beats_flat(place: str) -> tuple[Contrast, ...]:
+    master = f"{place}/{{schedule}}/appropriate-bias"
+    return _success_too(
+        (
+            _way("against flat, penalised", master, f"{place}/flat/{{guided}}penalised"),
+            _way("against flat, free", master, f"{place}/flat/{{guided}}free"),
+        )
+    )
+
+
+def _serves_better(place: str) -> tuple[Contrast, ...]:
+    plain = f"{place}/{{schedule}}/plain"
+    others = tuple(
+        _way(f"{kind} against plain", f"{place}/{{schedule}}/{kind}", plain, decides=kind == "appropriate-bias")
+        for kind in reversed(PAPER_REGULARISERS)
+    )
+    return _success_too(others[:1]) + others[1:]
+
+
+def _both(make: Callable[[str], tuple[Contrast, ...]]) -> tuple[Contrast, ...]:
+    return (*make("bandit"), *make("maze"))
+
+
+# Claims 1, 2, 7, 8, 9: "regularised" is appropriate bias, which the paper finds best; the others are shown beside it.
+CLAIMS: tuple[Claim, ...] = (
+    Claim(
+        1,
+        "With regularised sub-policies the hierarchy beats both flat policies on AntBandit.",
+        "8, Figure 6",
+        _beats_flat("bandit"),
+    ),
+    Claim(
+        2,
+        "With regularised sub-policies the hierarchy beats both flat policies on AntMaze.",
+        "8, Figure 5",
+        _beats_flat("maze"),
+    ),
+    Claim(
+        3,
+        "Flat policies without stability penalties beat those with them, on both tasks.",
+        "8, Figures 5 and 6",
+        _both(lambda place: (_way(place, f"{place}/flat/{{guided}}free", f"{place}/flat/{{guided}}penalised"),)),
+    ),
+    Claim(
+        4,
+        "On AntMaze the flat policy without penalties ends stuck behind a wall: most of its episodes end within "
+        "1 m of where the straight line to the goal meets the wall.",
+        "9",
+        (Contrast("share of episodes", ("maze/flat/free",), (1,), "stuck", "at least", 0.5),),
+    ),
+    Claim(
+        5,
+        "Unregularised sub-policies reach a higher training reward than regularised ones.",
+        "8, Figures 7 and 8",
+        tuple(
+            _greater(f"against {kind}", "walker/plain", f"walker/{kind}", "return", 50.0) for kind in PAPER_REGULARISERS
+        ),
+    ),
+    Claim(
+        6,
+        "The training reward of unregularised sub-policies varies less (standard deviation across seeds, "
+        "within directions).",
+        "8, Figures 7 and 8",
+        tuple(
+            Contrast(
+                f"{kind} less plain",
+                (f"walker/{kind}", "walker/plain"),
+                (1, -1),
+                "return by direction",
+                "greater",
+                50.0,
+                "spread",
+            )
+            for kind in PAPER_REGULARISERS
+        ),
+    ),
+    Claim(
+        7,
+        "Regularised sub-policies serve the master better on AntBandit.",
+        "8, Figure 9",
+        _serves_better("bandit"),
+        everywhere=True,
+    ),
+    Claim(
+        8,
+        "Regularised sub-policies serve the master better on AntMaze.",
+        "8, Figure 10",
+        _serves_better("maze"),
+        everywhere=True,
+    ),
+    Claim(
+        9,
+        "The gap between regularised and unregularised sub-policies is larger on AntMaze than on AntBandit.",
+        "8, Figures 9 and 10",
+        (
+            Contrast(
+                "gap on AntMaze less gap on AntBandit",
+                (
+                    "maze/{schedule}/appropriate-bias",
+                    "maze/{schedule}/plain",
+                    "bandit/{schedule}/appropriate-bias",
+                    "bandit/{schedule}/plain",
+                ),
+                (1, -1, -1, 1),
+                "way",
+                "greater",
+                0.05,
+            ),
+        ),
+        everywhere=True,
+    ),
+    Claim(
+        10,
+        "Appropriate bias is the best of the paper's three regularisers at handing over.",
+        "6",
+        tuple(
+            _greater(f"against {kind}", "walker/appropriate-bias", f"walker/{kind}", "handover", 0.05)
+            for kind in PAPER_REGULARISERS[:2]
+        ),
+        everywhere=True,
+    ),
+    Claim(
+        11,
+        "With appropriate bias transitions succeed almost always: in at least 95 % of orthogonal hand-overs the ant "
+        "neither falls nor flips and walks on at 0.5 m/s or more.",
+        "6",
+        (Contrast("share of hand-overs", ("walker/appropriate-bias",), (1,), "handover", "at least", 0.95),),
+        everywhere=True,
+    ),
+    Claim(
+        12,
+        "Unregularised ants consistently fail to hand over to an orthogonal policy: at most half of the hand-overs "
+        "succeed.",
+        "6",
+        (Contrast("share of hand-overs", ("walker/plain",), (1,), "handover", "at most", 0.5),),
+        everywhere=True,
+    ),
+    Claim(
+        13,
+        "Stability penalties in the master's reward make no difference.",
+        "8",
+        _both(
+            lambda place: tuple(
+                _same_way(
+                    f"{place}, {kind}", f"{place}/{{schedule}}-penalised/{kind}", f"{place}/{{schedule}}/{kind}", "same"
+                )
+                for kind in ("appropriate-bias", "plain")
+            )
+        ),
+    ),
+    Claim(
+        14,
+        "Interleaved sub-policies beat all three of the paper's, at handing over and under a master on AntMaze.",
+        "ours",
+        (
+            *(
+                _greater(f"hand-overs, against {kind}", "walker/interleaved", f"walker/{kind}", "handover", 0.05)
+                for kind in PAPER_REGULARISERS
+            ),
+            *(
+                _way(f"maze, against {kind}", "maze/{schedule}/interleaved", f"maze/{{schedule}}/{kind}")
+                for kind in PAPER_REGULARISERS
+            ),
+        ),
+        everywhere=True,
+    ),
+    Claim(
+        15,
+        "One symmetric policy serves a master as well as four policies.",
+        "ours",
+        _both(
+            lambda place: tuple(
+                _same_way(f"{place}, {one}", f"{place}/{{schedule}}/{one}", f"{place}/{{schedule}}/{four}", "not worse")
+                for one, four in (("symmetric", "plain"), ("symmetric-interleaved", "interleaved"))
+            )
+        ),
+    ),
+)
+
+SCHEDULES = {"paper": "the paper's reward and schedule", "hrl": "our reward and schedule"}
+
+
+def settings_of(claim: Claim, prefixes: Iterable[str] = ("",)) -> list[Setting]:
+    """Where a claim is judged: its masters with both schedules, its rows under each prefix if it says everywhere.
+
+    Only where the table has all the rows that decide.
+    """
+    rows = [row for c in claim.contrasts if c.decides for row in c.rows]
+    schedules = SCHEDULES if any("{" in row for row in rows) else {"paper": ""}
+    chosen = tuple(prefixes) if claim.everywhere else ("",)
+    settings = [Setting(prefix, schedule) for prefix in chosen for schedule in schedules]
+    return [setting for setting in settings if all(is_row(setting.fill(row)) for row in rows)]
+
+
+def rows_read(prefixes: Iterable[str] = ("",)) -> list[str]:
+    """Every row that a claim reads, in the order of the table."""
+    everything = tuple(prefixes)
+    read = {
+        setting.fill(row)
+        for claim in CLAIMS
+        for setting in settings_of(claim, everything)
+        for c in claim.contrasts
+        for row in c.rows
+    }
+    order = {name: i for i, name in enumerate(MAIN)}
+    return sorted(read, key=lambda name: (order.get(name, len(order)), name))
+
+
+def prefixes_at_hand(results: Results) -> tuple[str, ...]:
+    """The default engine and ant, and those others that have finished sub-policies in the study's folder."""
+    places = sorted(path for path in results.study.runs.glob("*/walker") if any(path.glob("*/*/DONE")))
+    found = []
+    for path in places:
+        prefix = f"{path.parent.name}/"
+        if any(is_row(prefix + row) for row in MAIN):
+            found.append(prefix)
+    return ("", *found)
+
+
+def judge_all(results: Results) -> list[Judgement]:
+    """Every claim in every setting at hand, in the order of the claims."""
+    prefixes = prefixes_at_hand(results)
+    return [judge(results, claim, setting) for claim in CLAIMS for setting in settings_of(claim, prefixes)]
+
+
+def judge(results: Results, claim: Claim, setting: Setting) -> Judgement:
+    """A claim's verdict in a setting, from the files of its runs."""
+    findings = tuple(_find(results, claim, c, setting) for c in claim.contrasts)
+    deciding = [finding for finding in findings if finding.contrast.decides]
+    verdict = _overall([finding.verdict for finding in deciding])
+    return Judgement(claim, setting, _where(claim, setting), findings, verdict, _why(claim, deciding, verdict))
+
+
+def _overall(verdicts: list[Verdict]) -> Verdict:
+    if "does not hold" in verdicts:
+        return "does not hold"
+    return "holds" if set(verdicts) == {"holds"} else "undecided"
+
+
+def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> Finding:
+    rows = tuple(setting.fill(row) for row in what.rows)
+    scores = [results.scores(row, what.metric) if is_row(row) else np.zeros(0) for row in rows]
+    seeds = tuple(len(score) for score in scores)
+    if not all(seeds):
+        return Finding(what, rows, seeds, None, None, "undecided", "undecided")
+    statistic: Statistic = spread if what.statistic == "spread" else overall_iqm
+    generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
+    effect = contrast(scores, what.weights, generator, statistic)
+    so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"
+    verdict = so_far if min(seeds) >= claim.min_seeds else "undecided"
+    return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far)
+
+
+def _probability(what: Contrast, scores: list[Floats]) -> float | None:
+    if len(scores) != 2:
+        return None
+    if what.statistic == "spread":  # that a run is farther from the middle of its row
+        scores = [np.abs(score - np.median(score, axis=0)) for score in scores]
+    return probability_of_improvement(*scores)
+
+
+def decide(rule: Rule, bound: float, effect: Effect) -> Verdict:
+    """What a rule says of an effect (see the table at the top)."""
+    estimate, low, high = effect
+    verdicts: dict[Rule, tuple[bool, bool]] = {
+        "greater": (low > 0 and estimate >= bound, high < bound),
+        "not worse": (low > -bound, high < 0 and estimate <= -bound),
+        "same": (-bound < low and high < bound, not low <= 0 <= high and abs(estimate) >= bound),
+        "at least": (low >= bound, high < bound),
+        "at most": (high <= bound, low > bound),
+    }
+    holds, fails = verdicts[rule]
+    return "holds" if holds else "does not hold" if fails else "undecided"
+
+
+def _where(claim: Claim, setting: Setting) -> str:
+    experiment = find_row(f"{setting.prefix}walker/plain")
+    engine = getattr(experiment, "engine", "mujoco")
+    where = f"{engine}, {experiment.task.robot.name} ant"
+    return f"{where}, {SCHEDULES[setting.schedule]}" if len(settings_of(claim)) > 1 else where
+
+
+def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
+    """One phrase that says what the verdict rests on, or what is missing."""
+    if verdict != "undecided":
+        return f"{min(min(f.seeds) for f in deciding)} seeds or more on every side"
+    missing = [row for f in deciding for row, n in zip(f.rows, f.seeds, strict=True) if n == 0]
+    if missing:
+        return f"no runs of {', '.join(dict.fromkeys(missing))}"
+    fewest = min(min(f.seeds) for f in deciding)
+    if fewest < claim.min_seeds:
+        return f"{fewest} seeds, {claim.min_seeds} are asked for; so far: {_overall([f.so_far for f in deciding])}"
+    return "the interval allows both"
+
+
+def show_effect(finding: Finding) -> str:
+    """The effect with its interval, in the metric's unit."""
+    if finding.effect is None:
+        return "-"
+    estimate, low, high = finding.effect
+    if METRICS[finding.contrast.metric].percent:
+        return f"{100 * estimate:.1f} [{100 * low:.1f}, {100 * high:.1f}] %"
+    return f"{estimate:.4g} [{low:.4g}, {high:.4g}]"
+
+
+__all__ = [
+    "CLAIMS",
+    "MIN_SEEDS",
+    "SCHEDULES",
+    "Claim",
+    "Contrast",
+    "Finding",
+    "Judgement",
+    "Setting",
+    "decide",
+    "judge",
+    "judge_all",
+    "prefixes_at_hand",
+    "rows_read",
+    "settings_of",
+    "show_effect",
+]

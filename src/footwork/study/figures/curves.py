@@ -1,0 +1,151 @@
+"""Training curves: the paper's Figures 5 to 10, and success against steps and against wall time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from footwork.arena import DIRECTIONS, shortest_path
+from footwork.study.figures.paths import DIRECTION_COLOURS
+from footwork.study.figures.style import empty, label_of, legend_below, look_of, panels
+from footwork.study.results import Curve, Results, Sample
+from footwork.study.statistics import DRAWS, Floats, curve_band, generator_for
+from footwork.train import Experiment
+
+_POINTS = 100
+Value = Callable[[Sample, Curve], Floats]  # of a seed's curve, [X]
+SCHEDULE_TITLES = {"paper": "the paper's reward and schedule", "hrl": "our reward and schedule"}
+
+
+def way_at_start(experiment: Experiment) -> float:
+    """Distance to the goal at the start in the row's own potential, m."""
+    task = experiment.task
+    if task.potential == "straight":
+        return float(np.hypot(*np.subtract(task.arena.goals[0], task.arena.start)))
+    way = np.array(shortest_path(task.arena))
+    return float(np.hypot(*np.diff(way, axis=0).T).sum())
+
+
+def share_of_way(sample: Sample, curve: Curve) -> Floats:
+    """The distance part of the reward, in the row's own potential, as a share of what the whole way pays."""
+    metres = curve.values["progress"][:, 0] * sample.experiment.task.robot.control_dt
+    return np.asarray(metres / way_at_start(sample.experiment))
+
+
+def success(sample: Sample, curve: Curve) -> Floats:
+    """Share of the training episodes that ended in the goal, over the last twentieth of the training each time."""
+    episodes = curve.episodes[:, 0]
+    hits = np.nan_to_num(curve.values["success"][:, 0]) * episodes
+    window = np.ones(max(1, len(episodes) // 20))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.convolve(hits, window)[: len(hits)] / np.convolve(episodes, window)[: len(hits)])
+
+
+def on_common_grid(xs: list[Floats], ys: list[Floats]) -> tuple[Floats, Floats] | None:
+    """Curves of several seeds at the same points: x [X] and y [S, X]; None where nothing is finite."""
+    pairs = [(x[np.isfinite(y)], y[np.isfinite(y)]) for x, y in zip(xs, ys, strict=True)]
+    pairs = [(x, y) for x, y in pairs if x.size]
+    if not pairs:
+        return None
+    low, high = max(x[0] for x, _ in pairs), min(x[-1] for x, _ in pairs)
+    grid = np.linspace(min(low, high), high, _POINTS)
+    return grid, np.stack([np.interp(grid, x, y) for x, y in pairs])
+
+
+def draw_curve(ax: Any, xs: list[Floats], ys: list[Floats], name: str, colour: str, line: Any, label: str) -> bool:
+    """IQM over seeds with its 95 % band; whether there was anything to draw."""
+    found = on_common_grid(xs, ys)
+    if found is None:
+        return False
+    x, y = found
+    middle, (low, high) = curve_band(y, generator_for(f"curve {name}"), DRAWS)
+    ax.plot(x, middle, color=colour, ls=line, lw=1.5, label=label)
+    if len(y) > 1:
+        ax.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
+    return True
+
+
+def draw_row(ax: Any, results: Results, row: str, value: Value, x: str = "step") -> bool:
+    """A row's curve against control steps or seconds."""
+    curves = results.curves(row)
+    if not curves:
+        return False
+    look = look_of(row)
+    xs = [curve.step if x == "step" else curve.seconds / 60 for _, curve in curves]
+    ys = [value(sample, curve) for sample, curve in curves]
+    label = f"{label_of(row)}"
+    return draw_curve(ax, xs, ys, f"{row} {x} {value.__name__}", look.colour, look.line, label)
+
+
+def task_curves(results: Results, rows: tuple[str, ...]) -> Any:
+    """Masters (and flat policies) of one task, with the paper's reward and schedule and with ours."""
+    kinds = {"paper": [r for r in rows if not _ours(r)], "hrl": [r for r in rows if _ours(r)]}
+    figure, axes = panels(1, 2, 3.5, share_y=True)
+    for ax, (schedule, mine) in zip(axes[0], kinds.items(), strict=True):
+        drawn = [draw_row(ax, results, row, share_of_way) for row in mine]
+        ax.set_title(SCHEDULE_TITLES[schedule])
+        ax.axhline(1.0, color="#999999", lw=0.8, ls=":")
+        ax.set_xlabel("control steps")
+        _plain_steps(ax)
+        if not any(drawn):
+            empty(ax, "no finished runs yet")
+    axes[0, 0].set_ylabel("distance part of the reward\n(share of the whole way; 1: at the goal)")
+    legend_below(figure, axes[0])
+    return figure
+
+
+def _ours(row: str) -> bool:
+    return "/hrl" in row or "guided" in row
+
+
+def direction_curves(results: Results, rows: tuple[str, ...]) -> Any:
+    """Training reward of sub-policies, one curve per direction, one panel per row."""
+    columns = min(len(rows), 2)
+    figure, axes = panels(-(-len(rows) // columns), columns, 2.7 if len(rows) > 1 else 3.4, share_y=True)
+    for ax, row in zip(axes.flat, rows, strict=False):
+        curves = results.curves(row)
+        for i, direction in enumerate(DIRECTIONS):
+            if curves and curves[0][1].values["return"].shape[1] == len(DIRECTIONS):
+                xs = [curve.step for _, curve in curves]
+                ys = [curve.values["return"][:, i] for _, curve in curves]
+                line = ("-", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1)))[i]
+                draw_curve(ax, xs, ys, f"{row} {direction}", DIRECTION_COLOURS[i], line, direction)
+        ax.set_title(f"{row}\n{_count(len(curves))}")
+        ax.set_xlabel("control steps per direction")
+        _plain_steps(ax)
+        if not curves:
+            empty(ax, "no finished runs yet")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("training reward per episode")
+    legend_below(figure, list(axes.flat))
+    return figure
+
+
+def success_curves(results: Results, rows: tuple[str, ...]) -> Any:
+    """Share of training episodes that end in the goal, against control steps and against wall time."""
+    figure, axes = panels(2, 2, 2.7, share_y=True)
+    for line, place in zip(axes, ("bandit", "maze"), strict=True):
+        for ax, x in zip(line, ("step", "minutes"), strict=True):
+            drawn = [draw_row(ax, results, row, success, x) for row in rows if f"/{place}/" in f"/{row}"]
+            ax.set_xscale("symlog", linthresh=20_000 if x == "step" else 0.2)
+            ax.set_title(f"Ant{place.capitalize()}")
+            ax.set_xlabel("control steps" if x == "step" else "minutes of training")
+            ax.set_ylim(-0.03, 1.03)
+            if not any(drawn):
+                empty(ax, "no finished runs yet")
+        line[0].set_ylabel("episodes that end in the goal")
+    legend_below(figure, list(axes.flat))
+    return figure
+
+
+def _plain_steps(ax: Any) -> None:
+    ax.xaxis.set_major_locator(MaxNLocator(5))
+    ax.xaxis.set_major_formatter(lambda x, _: f"{x / 1e6:g} M" if x else "0")
+    ax.set_xlim(left=0)
+
+
+def _count(seeds: int) -> str:
+    return f"({seeds} seed{'' if seeds == 1 else 's'})"

@@ -1,0 +1,127 @@
+"""How figures look: colours that keep apart for the colour-blind, line styles that keep apart in print."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+DPI = 160
+WIDTH = 7.2  # inches, of a page
+_RC: dict[Any, Any] = {
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "footwork",  # the same figure is the same file
+    "figure.constrained_layout.use": True,
+}
+
+
+class Look(NamedTuple):
+    """Of a row, wherever it is drawn: Okabe and Ito's colours, and a line and a mark of its own."""
+
+    colour: str
+    line: Any
+    mark: str
+
+
+LOOKS: dict[str, Look] = {
+    "plain": Look("#000000", "-", "o"),
+    "random-start": Look("#E69F00", (0, (5, 1)), "s"),
+    "random-repeated": Look("#56B4E9", (0, (3, 1, 1, 1)), "^"),
+    "appropriate-bias": Look("#0072B2", (0, (7, 2)), "D"),
+    "interleaved": Look("#009E73", "-", "v"),
+    "symmetric": Look("#CC79A7", (0, (1, 1)), "P"),
+    "symmetric-interleaved": Look("#D55E00", (0, (4, 1, 1, 1, 1, 1)), "X"),
+    "free": Look("#7A7A7A", (0, (2, 2)), "<"),
+    "penalised": Look("#7A7A7A", (0, (1, 3)), ">"),
+    "guided-free": Look("#A6761D", (0, (2, 2)), "<"),
+    "guided-penalised": Look("#A6761D", (0, (1, 3)), ">"),
+}
+_OTHER = Look("#444444", "-", ".")
+
+
+def look_of(row: str) -> Look:
+    """How a row is drawn, by the last part of its address."""
+    return LOOKS.get(row.rpartition("/")[2], _OTHER)
+
+
+def label_of(row: str) -> str:
+    """What a row is called in a legend."""
+    last = row.rpartition("/")[2]
+    return f"flat, {last}" if "/flat/" in row else last
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw in the style of the study."""
+    with plt.rc_context(_RC):
+        yield
+
+
+def panels(
+    rows: int, columns: int, height: float, share_y: bool = False, layout: str = "constrained"
+) -> tuple[Any, Any]:
+    """A figure as wide as a page, and its axes [rows, columns]; ``height`` of one row in inches."""
+    size = (WIDTH, height * rows)
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, sharey=share_y, layout=layout)
+
+
+def save(figure: Any, path: Path, note: str = "") -> list[Path]:
+    """Write PNG and SVG beside each other; a note (of a small study) stands on the figure itself."""
+    if note:
+        figure.text(1.0, 1.015, note, ha="right", va="bottom", fontsize=8, color="#B00020", weight="bold")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
+    figure.savefig(png, dpi=DPI, bbox_inches="tight", metadata={"Software": None})
+    figure.savefig(svg, bbox_inches="tight", metadata={"Date": None})
+    plt.close(figure)
+    return [png, svg]
+
+
+def legend_below(figure: Any, axes: Sequence[Any], columns: int = 4) -> None:
+    """One legend for several axes, each label once."""
+    handles: dict[str, Any] = {}
+    for ax in axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    if handles:
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+
+
+def empty(ax: Any, what: str) -> None:
+    """Say on the axes themselves that there is nothing to draw yet."""
+    ax.set_xticks([])
+    ax.text(0.5, 0.5, what, transform=ax.transAxes, ha="center", va="center", color="#888888", wrap=True)
+
+
+def interval_marks(ax: Any, x: Sequence[float], effects: Sequence[Any], look: Look, label: str) -> None:
+    """Points with their intervals as bars."""
+    middle = np.array([e.estimate for e in effects])
+    below, above = middle - [e.low for e in effects], np.array([e.high for e in effects]) - middle
+    ax.errorbar(
+        x,
+        middle,
+        yerr=np.maximum([below, above], 0.0),
+        color=look.colour,
+        ls=look.line,
+        marker=look.mark,
+        ms=4.5,
+        lw=1.3,
+        capsize=2,
+        label=label,
+    )

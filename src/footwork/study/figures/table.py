@@ -1,0 +1,262 @@
+"""The figures as rows: which there are, what each reads, and what it answers in the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from footwork.study.experiments import is_row
+from footwork.study.figures import curves, measures, paths, scenes
+from footwork.study.figures.style import save, styled
+from footwork.study.results import Results
+
+_KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias", "interleaved")
+_ALL_KINDS = (*_KINDS, "symmetric", "symmetric-interleaved")
+_SCHEDULES = ("paper", "hrl")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure.
+
+    Args:
+        name: its file's name, and what the command line calls it.
+        title: one line.
+        caption: how to read it.
+        draw: from the results and the rows, a matplotlib figure.
+        rows: that it reads.
+        paper: the figure of the paper that it answers, if any.
+    """
+
+    name: str
+    title: str
+    caption: str
+    draw: Callable[[Results, tuple[str, ...]], Any]
+    rows: tuple[str, ...] = ()
+    paper: str = ""
+
+
+class Drawn(NamedTuple):
+    """A figure as it was written."""
+
+    figure: Figure
+    files: tuple[Path, ...]
+    without: tuple[str, ...]  # rows that it reads and that have no finished runs
+    prefix: str = ""  # of its rows: another engine or ant
+
+
+def _against_flat(place: str) -> tuple[str, ...]:
+    kinds = ("appropriate-bias", "interleaved", "symmetric-interleaved")
+    masters = [f"{place}/{schedule}/{kind}" for schedule in _SCHEDULES for kind in kinds]
+    flats = [f"{place}/flat/{name}" for name in ("free", "penalised", "guided-free", "guided-penalised")]
+    return (*masters, *flats)
+
+
+def _on_kinds(
+    place: str, kinds: tuple[str, ...] = _ALL_KINDS, schedules: tuple[str, ...] = _SCHEDULES
+) -> tuple[str, ...]:
+    return tuple(f"{place}/{schedule}/{kind}" for schedule in schedules for kind in kinds)
+
+
+def _walkers(kinds: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"walker/{kind}" for kind in kinds)
+
+
+_BANDS = "Interquartile mean over seeds, 95 % stratified-bootstrap bands."
+_REWARD = f"Only the distance part of the reward, as the paper plots; in shares of the whole way. {_BANDS}"
+
+FIGURES: tuple[Figure, ...] = (
+    Figure(
+        "01-walker",
+        "AntWalker",
+        "One direction is walked in; the orb only shows which. The target is 10 km away.",
+        scenes.walker_scene,
+        paper="Figure 1",
+    ),
+    Figure(
+        "02-bandit",
+        "AntBandit",
+        "At each reset one of the four corners becomes the goal, and the ant is told which.",
+        scenes.bandit_scene,
+        paper="Figure 2",
+    ),
+    Figure(
+        "03-maze",
+        "AntMaze",
+        "The straight line to the goal (dotted) leads into a wall. Walls are drawn lower than they are.",
+        scenes.maze_scene,
+        paper="Figure 3",
+    ),
+    Figure(
+        "04-hierarchy",
+        "The two-level hierarchy",
+        "Every k control steps the master chooses one of four frozen sub-policies.",
+        scenes.hierarchy,
+        paper="Figure 4",
+    ),
+    Figure(
+        "05-maze-reward",
+        "AntMaze: hierarchies and flat policies",
+        _REWARD,
+        curves.task_curves,
+        _against_flat("maze"),
+        "Figure 5",
+    ),
+    Figure(
+        "06-bandit-reward",
+        "AntBandit: hierarchies and flat policies",
+        _REWARD,
+        curves.task_curves,
+        _against_flat("bandit"),
+        "Figure 6",
+    ),
+    Figure(
+        "07-unregularised",
+        "Training of unregularised sub-policies",
+        f"Training reward of each direction. {_BANDS}",
+        curves.direction_curves,
+        ("walker/plain",),
+        "Figure 7",
+    ),
+    Figure(
+        "08-regularised",
+        "Training of regularised sub-policies",
+        f"Training reward of each direction, the steps of noise or of a partner included. {_BANDS}",
+        curves.direction_curves,
+        _walkers(("random-start", "random-repeated", "appropriate-bias", "interleaved")),
+        "Figure 8",
+    ),
+    Figure(
+        "09-bandit-sub-policies",
+        "AntBandit: masters on regularised and unregularised sub-policies",
+        _REWARD,
+        curves.task_curves,
+        _on_kinds("bandit"),
+        "Figure 9",
+    ),
+    Figure(
+        "10-maze-sub-policies",
+        "AntMaze: masters on regularised and unregularised sub-policies",
+        _REWARD,
+        curves.task_curves,
+        _on_kinds("maze"),
+        "Figure 10",
+    ),
+    Figure(
+        "11-handovers",
+        "Hand-overs: from each direction to each",
+        "Upper number: per cent of hand-overs without fall or flip, at 0.5 m/s or more; lower: mean speed after (m/s).",
+        measures.handover_maps,
+        _walkers(_ALL_KINDS),
+    ),
+    Figure(
+        "12-switching",
+        "Random switching for 2000 control steps",
+        "A new direction drawn from all four every so often; an option under 0.2 m/s is idle. IQM, 95 % intervals.",
+        measures.switching,
+        _walkers(_ALL_KINDS),
+    ),
+    Figure(
+        "13-option-length",
+        "The length k of an option",
+        "IQM over seeds with 95 % intervals, masters on interleaved sub-policies.",
+        measures.k_grids,
+    ),
+    Figure(
+        "14-regulariser-length",
+        "The length t of each regulariser",
+        "IQM over seeds with 95 % intervals. Hand-overs between orthogonal directions; speed without hand-overs.",
+        measures.t_grids,
+    ),
+    Figure(
+        "15-success",
+        "Success in training, against steps and against wall time",
+        f"Share of the episodes that end in the goal, sub-policies' own training not counted. {_BANDS}",
+        curves.success_curves,
+        (
+            *_on_kinds("bandit", schedules=("hrl",)),
+            "bandit/flat/free",
+            "bandit/flat/guided-free",
+            *_on_kinds("maze", schedules=("hrl",)),
+            "maze/flat/free",
+            "maze/flat/guided-free",
+        ),
+    ),
+    Figure(
+        "16-paths",
+        "Paths through the maze",
+        "Twelve episodes of the first seed; a master's coloured by the sub-policy in use, a flat policy's grey.",
+        paths.maze_paths,
+        (
+            *(f"maze/hrl/{kind}" for kind in ("plain", "appropriate-bias", "interleaved", "symmetric-interleaved")),
+            "maze/paper/appropriate-bias",
+            "maze/flat/free",
+        ),
+    ),
+    Figure(
+        "17-flat-ends",
+        "Where the episodes of flat policies end",
+        "A point per episode, all seeds. Circle: within 1 m of where the straight line to the goal meets the wall.",
+        paths.flat_ends,
+        tuple(f"maze/flat/{kind}" for kind in ("free", "penalised", "guided-free", "guided-penalised")),
+    ),
+    Figure(
+        "18-profiles",
+        "Performance profiles",
+        "How many runs get farther than each share of the way.",
+        measures.profiles,
+        (
+            *_on_kinds("bandit", _KINDS, ("hrl",)),
+            "bandit/flat/guided-free",
+            *_on_kinds("maze", _KINDS, ("hrl",)),
+            "maze/flat/guided-free",
+        ),
+    ),
+    Figure(
+        "19-choices",
+        "What the paper leaves open: B, the potential, the ant",
+        "IQM over seeds with 95 % intervals.",
+        measures.comparisons,
+        ("walker/plain", "walker/interleaved", "maze/hrl/plain", "maze/hrl/interleaved"),
+    ),
+)
+
+
+def find_figures(names: Iterable[str]) -> list[Figure]:
+    """Figures by name, or by the number at its beginning; all for none.
+
+    Raises:
+        ValueError: there is none of that name; lists those there are.
+    """
+    known = {figure.name: figure for figure in FIGURES}
+    by_number = {str(int(name.partition("-")[0])): figure for name, figure in known.items()}
+    chosen = []
+    for name in names:
+        figure = known.get(name) or by_number.get(name.lstrip("0"))
+        if figure is None:
+            raise ValueError(f"unknown figure {name!r}; known figures: {', '.join(known)}")
+        chosen.append(figure)
+    return chosen or list(FIGURES)
+
+
+def draw_figures(results: Results, figures: Iterable[Figure], to: Path, prefix: str = "") -> list[Drawn]:
+    """Draw figures into a folder, each as PNG and as SVG.
+
+    With a prefix such as ``light/``, the same of the rows under it, into a folder of that name: results of
+    different engines and ants stay apart. Figures of which there is nothing under it are left out.
+    """
+    note = "" if results.study.size.name == "full" else f"{results.study.size.name} study: short runs, few seeds"
+    note = "runs of any length" if results.any_length else note
+    note = " - ".join(part for part in (prefix.strip("/"), note) if part)
+    drawn = []
+    for figure in figures:
+        rows = tuple(prefix + row for row in figure.rows if is_row(prefix + row))
+        without = tuple(row for row in rows if not results.samples(row))
+        if prefix and len(without) == len(rows):
+            continue
+        with styled():
+            files = save(figure.draw(results, rows), to / prefix / figure.name, note)
+        drawn.append(Drawn(figure, tuple(files), without, prefix))
+    return drawn

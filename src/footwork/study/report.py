@@ -1,0 +1,411 @@
+"""The report: claims first, then the paper in its order, every figure, every row, and what was left out.
+
+``REPORT.md`` with the figures beside it, and the same as one HTML page that needs nothing else. Written
+from files alone; ``results/`` beside it holds the small ones of every run that counts, enough to
+make the report again.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+import platform
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import footwork
+from footwork.checkpoint import write_atomically
+from footwork.study.claims import CLAIMS, Finding, Judgement, judge_all, prefixes_at_hand, rows_read, show_effect
+from footwork.study.experiments import EXPERIMENTS, find_row, is_row
+from footwork.study.figures import FIGURES, Drawn, draw_figures
+from footwork.study.measure import EVALUATION, TRANSITIONS
+from footwork.study.plan import STUDY_FILE, read_machine
+from footwork.study.results import CURVE, METRICS, Results, write_curve
+from footwork.study.statistics import iqm
+from footwork.train import planned_steps
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A sentence of the paper, and where the report answers it."""
+
+    section: str
+    words: str
+    claims: tuple[int, ...] = ()
+    figures: tuple[int, ...] = ()
+
+
+# The paper in its own order; its sentences shortened.
+ANSWERS: tuple[Answer, ...] = (
+    Answer("3.1", "AntWalker: four directions, targets 10 km away (Figure 1)", figures=(1,)),
+    Answer("3.2", "AntBandit: one of the four corners of a square (Figure 2)", figures=(2,)),
+    Answer("3.3", "AntMaze: a fixed point in a maze (Figure 3)", figures=(3,)),
+    Answer("3.4", "The vanilla ant in PyBullet is heavier than MuJoCo's, which makes it harder", figures=(19,)),
+    Answer("4", "Every k steps the master decides which policy runs next (Figure 4)", figures=(4,)),
+    Answer("4", "k is a hyperparameter (not stated)", figures=(13,)),
+    Answer("6", "The agent consistently fails to transition to an orthogonal policy", (12,), (11,)),
+    Answer("6", "Random start, random repeated: t timesteps (not stated)", figures=(14,)),
+    Answer("6", "Appropriate bias seems to work best", (10,), (11, 12)),
+    Answer("6", "Transitions take place successfully almost always", (11,), (11,)),
+    Answer("7", "Create B = 32 batches, of S = 128 and 40 (a number, or a size?)", figures=(19,)),
+    Answer("8", "Stability penalties while training the master do not make a difference", (13,)),
+    Answer("8", "The regularised hierarchy outperforms the flat policies (Figures 5, 6)", (1, 2), (5, 6, 15, 18)),
+    Answer("8", "Flat policies without stability penalties perform better than with them", (3,), (5, 6)),
+    Answer("8", "Unregularised sub-policies show a considerably smaller variance (Figures 7, 8)", (6,), (7, 8)),
+    Answer("8", "Unregularised policies achieve higher rewards eventually", (5,), (7, 8)),
+    Answer("8", "... but do not allow smooth transitions", (12,), (11, 12)),
+    Answer("8", "Regularised sub-policies serve as much better slaves (Figures 9, 10)", (7, 8), (9, 10, 16)),
+    Answer("8", "The difference is much more pronounced on AntMaze", (9,), (9, 10)),
+    Answer("9", "Moving straight to the target, the flat policy gets stuck in a wall", (4,), (16, 17)),
+    Answer("ours", "Interleaved sub-policies; one symmetric policy", (14, 15), (11, 12)),
+)
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading; the level as in HTML."""
+
+    text: str
+    level: int = 2
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Code:
+    """Commands."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class TableBlock:
+    """A table; cells are plain text, lines in them separated by newlines."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure with its caption."""
+
+    drawn: Drawn
+
+
+Block = Heading | Text | Code | TableBlock | Picture
+
+
+def write_report(results: Results, to: Path, command: str) -> list[Path]:
+    """Draw every figure, judge every claim, and write it all into a folder.
+
+    Args:
+        results: of a study.
+        to: the folder; what it holds of an earlier report is replaced.
+        command: the line that made this report.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    prefixes = prefixes_at_hand(results)
+    drawn = [one for prefix in prefixes for one in draw_figures(results, FIGURES, to / "figures", prefix)]
+    blocks = report_blocks(results, drawn, command)
+    pages = {"REPORT.md": _markdown(blocks, to), "report.html": _page(blocks, _title(results))}
+    for name, text in pages.items():
+        write_atomically(to / name, text.encode())
+    export(results, to / "results")
+    return [to / name for name in pages]
+
+
+def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> list[Block]:
+    """The report, whatever it is to be written as."""
+    judgements = judge_all(results)
+    rows = [row for row in _all_rows(results) if results.samples(row)]
+    blocks: list[Block] = [Heading(_title(results), 1), Text(_summary(results, judgements, rows))]
+    if results.study.size.short is not None:
+        blocks.append(
+            Text(
+                "**Quick study: runs of a few updates and few seeds. It shows that everything works, not what holds.**"
+            )
+        )
+    blocks += [Heading("Claims"), _claims_table(judgements), Text(_READING)]
+    blocks += [Heading("Every comparison", 3), _comparisons_table(judgements)]
+    blocks += [Heading("The paper, in its order"), _answers_table(judgements)]
+    blocks += [Heading("Figures"), *[Picture(d) for d in drawn]]
+    blocks += [Heading("Rows"), _rows_table(results, rows)]
+    blocks += [Heading("Left out, and why"), *_left_out(results, drawn)]
+    blocks += [Heading("How this was made"), *_made(results, rows, command)]
+    return blocks
+
+
+_READING = (
+    "An effect is a difference of interquartile means over seeds (of shares: in percentage points) with its 95 % "
+    "stratified-bootstrap interval, seeds drawn within each row. P is the probability that a run of the first row "
+    "scores higher than one of the second. Rules, margins and the number of seeds asked for stood in "
+    "footwork/study/claims.py before the runs. Masters and flat policies are judged by the way: how much nearer to "
+    "the goal an episode ends than it began, along the straight line, as a share of the distance at the start. That "
+    "is the distance part of the reward, which is what the paper plots."
+)
+
+
+def _title(results: Results) -> str:
+    size = results.study.size
+    return "Footwork: the study" + ("" if size.name == "full" else f" ({size.name})")
+
+
+def _summary(results: Results, judgements: Sequence[Judgement], rows: Sequence[str]) -> str:
+    count = {
+        verdict: sum(j.verdict == verdict for j in judgements) for verdict in ("holds", "does not hold", "undecided")
+    }
+    said = ", ".join(f"{number} {verdict}" for verdict, number in count.items())
+    seeds = sum(len(results.samples(row)) for row in rows)
+    length = " Runs of any length count." if results.any_length else ""
+    return f"{len(CLAIMS)} claims in {len(judgements)} settings: {said}. {seeds} runs of {len(rows)} rows.{length}"
+
+
+def _all_rows(results: Results) -> list[str]:
+    """The table, and the same under every engine or ant at hand."""
+    elsewhere = [prefix + row for prefix in prefixes_at_hand(results) if prefix for row in EXPERIMENTS]
+    known = [row for row in elsewhere if row not in EXPERIMENTS and is_row(row)]
+    return [*EXPERIMENTS, *known]
+
+
+def _claims_table(judgements: Sequence[Judgement]) -> TableBlock:
+    rows = []
+    for j in judgements:
+        said = "\n".join(_said(f) for f in j.findings if f.contrast.decides)
+        rows.append((str(j.claim.number), f"{j.claim.words}\n({_source(j)})", j.where, j.verdict, said, j.why))
+    return TableBlock(("", "claim", "where", "verdict", "effect [95 %], P, seeds", "because"), tuple(rows))
+
+
+def _said(finding: Finding) -> str:
+    """A comparison in one line."""
+    chance = "" if finding.probability is None else f", P {finding.probability:.2f}"
+    return f"{finding.contrast.words}: {show_effect(finding)}{chance}, {_seeds(finding.seeds)} seeds"
+
+
+def _source(judgement: Judgement) -> str:
+    section = judgement.claim.section
+    return section if section == "ours" else f"section {section}"
+
+
+def _seeds(counts: tuple[int, ...]) -> str:
+    return str(counts[0]) if len(set(counts)) == 1 else " / ".join(map(str, counts))
+
+
+def _comparisons_table(judgements: Sequence[Judgement]) -> TableBlock:
+    rows = [
+        (
+            str(j.claim.number),
+            j.where,
+            f.contrast.words + ("" if f.contrast.decides else " (shown only)"),
+            " ".join(
+                f"{'+' if w > 0 else '−'} {row}" for w, row in zip(f.contrast.weights, f.rows, strict=True)
+            ).removeprefix("+ "),
+            METRICS[f.contrast.metric].words,
+            f"{f.contrast.rule}, {METRICS[f.contrast.metric].show(f.contrast.bound)}",
+            show_effect(f),
+            "-" if f.probability is None else f"{f.probability:.2f}",
+            _seeds(f.seeds),
+            f.verdict if f.verdict == f.so_far else f"{f.verdict} (so far: {f.so_far})",
+        )
+        for j in judgements
+        for f in j.findings
+    ]
+    header = ("", "where", "what", "rows", "metric", "rule, bound", "effect [95 %]", "P", "seeds", "verdict")
+    return TableBlock(header, tuple(rows))
+
+
+def _answers_table(judgements: Sequence[Judgement]) -> TableBlock:
+    rows = []
+    for answer in ANSWERS:
+        said = [
+            f"claim {j.claim.number}, {j.where}: {j.verdict}" for j in judgements if j.claim.number in answer.claims
+        ]
+        rows.append((answer.section, answer.words, "\n".join(said) or "-", ", ".join(map(str, answer.figures)) or "-"))
+    return TableBlock(("section", "the paper says", "answer", "figures"), tuple(rows))
+
+
+def _rows_table(results: Results, rows: Sequence[str]) -> TableBlock:
+    metrics = ("way", "success", "handover", "speed", "return")
+    lines = []
+    for row in rows:
+        experiment, walker = results.study.row(row), find_row(row).is_walker
+        shown = {"handover", "speed", "return"} if walker else {"way", "success"}
+        cells = [_middle(results, row, name) if name in shown else "" for name in metrics]
+        minutes = [curve.seconds[-1] / 60 for _, curve in results.curves(row)]
+        steps = f"{planned_steps(experiment):,}" + (" × 4" if experiment.runs_per_seed > 1 else "")
+        wall = f"{np.mean(minutes):.1f}" if minutes else "-"
+        lines.append((row, str(len(results.samples(row))), steps, wall, *cells))
+    header = ("row", "seeds", "control steps", "minutes", "way", "within 1 m", "hand-overs", "m/s", "training return")
+    return TableBlock(header, tuple(lines))
+
+
+def _middle(results: Results, row: str, metric: str) -> str:
+    scores = results.scores(row, metric)
+    return METRICS[metric].show(float(iqm(scores))) if len(scores) else "-"
+
+
+def _left_out(results: Results, drawn: Sequence[Drawn]) -> list[Block]:
+    missing = list(dict.fromkeys(row for d in drawn for row in d.without))
+    missing += [row for row in rows_read() if row not in missing and not results.samples(row)]
+    blocks: list[Block] = []
+    if missing:
+        blocks.append(Text(f"Rows that a claim or a figure reads and that have no finished run: {', '.join(missing)}."))
+    if results.problems:
+        blocks.append(TableBlock(("file or run",), tuple((problem,) for problem in results.problems)))
+    return blocks or [Text("Nothing.")]
+
+
+def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
+    found: dict[tuple[str, str], int] = {}
+    for row in rows:
+        for sample in results.samples(row):
+            for name, version in sample.run.versions().items():
+                found[name, str(version)] = found.get((name, str(version)), 0) + 1
+    versions = tuple((name, version, str(count)) for (name, version), count in sorted(found.items()))
+    machine = read_machine(results.study.runs) or "not recorded"
+    here = f"footwork {footwork.__version__}, Python {platform.python_version()}"
+    again = "footwork report --runs results --to .  # in this folder: the same report from the files beside it"
+    return [
+        Code(f"{command}\n{again}"),
+        Text(f"Machine of the runs: {machine}. Report written by {here}."),
+        TableBlock(("version of", "is", "runs"), versions),
+    ]
+
+
+def export(results: Results, to: Path) -> None:
+    """Copy the small files of every run that was read: enough to draw and to judge again.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    if to.resolve() == results.study.runs.resolve():
+        return
+    if to.is_dir():
+        shutil.rmtree(to)
+    for row, samples in results.all_samples().items():
+        for run, sample in {sample.run: sample for sample in samples}.items():
+            place = to / row / run.path.name
+            place.mkdir(parents=True, exist_ok=True)
+            for name in ("config.json", "DONE", EVALUATION, TRANSITIONS):
+                if (run.path / name).is_file():
+                    shutil.copyfile(run.path / name, place / name)
+            curve = results.whole_curve(sample)
+            if curve is not None:
+                write_curve(place / CURVE, curve, None)
+    if (results.study.runs / STUDY_FILE).is_file():
+        shutil.copyfile(results.study.runs / STUDY_FILE, to / STUDY_FILE)
+
+
+# Markdown and HTML ----------------------------------------------------------------------------------------------------
+
+
+def _markdown(blocks: Sequence[Block], to: Path) -> str:
+    return "\n\n".join(_as_markdown(block, to) for block in blocks) + "\n"
+
+
+def _as_markdown(block: Block, to: Path) -> str:
+    match block:
+        case Heading(text, level):
+            return f"{'#' * level} {text}"
+        case Text(text):
+            return text
+        case Code(text):
+            return f"```\n{text}\n```"
+        case TableBlock(header, rows):
+            lines = [header, ("---",) * len(header), *rows]
+            return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
+        case Picture(drawn):
+            png, svg = (os.path.relpath(path, to) for path in drawn.files)
+            return f"### {_heading(drawn)}\n\n![{drawn.figure.title}]({png})\n\n{_caption(drawn)} [SVG]({svg})"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", "<br>")
+
+
+def _heading(drawn: Drawn) -> str:
+    figure = drawn.figure
+    number = figure.name.partition("-")[0].lstrip("0")
+    paper = f" (the paper's {figure.paper})" if figure.paper else ""
+    where = f", {drawn.prefix.strip('/')}" if drawn.prefix else ""
+    return f"{number}. {figure.title}{where}{paper}"
+
+
+def _caption(drawn: Drawn) -> str:
+    without = f" Without finished runs: {', '.join(drawn.without)}." if drawn.without else ""
+    under = f" --under {drawn.prefix.strip('/')}" if drawn.prefix else ""
+    return f"{drawn.figure.caption}{without} Drawn by `footwork figures {drawn.figure.name}{under}`."
+
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c1c1c; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
+table { border-collapse: collapse; font-size: 13px; margin: 1rem 0; display: block; overflow-x: auto; }
+th, td { border-bottom: 1px solid #ddd; padding: .3rem .6rem; text-align: left; vertical-align: top;
+  white-space: pre-line; }
+th { border-bottom: 2px solid #999; }
+.holds { color: #00664b; font-weight: 600; } .does-not-hold { color: #a33b00; font-weight: 600; }
+.undecided { color: #555; font-weight: 600; }
+figure { margin: 2rem 0; } img { max-width: 100%; height: auto; } figcaption { font-size: 14px; color: #444; }
+pre { background: #f5f4f0; padding: .8rem; overflow-x: auto; }
+"""
+
+
+def _page(blocks: Sequence[Block], title: str) -> str:
+    body = "\n".join(_as_html(block) for block in blocks)
+    head = (
+        f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
+    )
+    return (
+        f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head><body>\n{body}\n</body></html>\n'
+    )
+
+
+def _as_html(block: Block) -> str:
+    match block:
+        case Heading(text, level):
+            return f"<h{level}>{html.escape(text)}</h{level}>"
+        case Text(text):
+            return f"<p>{_inline(text)}</p>"
+        case Code(text):
+            return f"<pre>{html.escape(text)}</pre>"
+        case TableBlock(header, rows):
+            lines = ["".join(f"<th>{html.escape(cell)}</th>" for cell in header)]
+            lines += ["".join(_table_cell(cell) for cell in row) for row in rows]
+            return "<table>" + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+        case Picture(drawn):
+            data = base64.b64encode(drawn.files[0].read_bytes()).decode()
+            image = f'<img src="data:image/png;base64,{data}" alt="{html.escape(drawn.figure.title)}">'
+            caption = f"<figcaption>{_inline(_caption(drawn))}</figcaption>"
+            return f"<figure><h3>{html.escape(_heading(drawn))}</h3>{image}{caption}</figure>"
+
+
+def _table_cell(text: str) -> str:
+    verdict = text if text in ("holds", "does not hold", "undecided") else ""
+    mark = f' class="{verdict.replace(" ", "-")}"' if verdict else ""
+    return f"<td{mark}>{html.escape(text)}</td>"
+
+
+def _inline(text: str) -> str:
+    """Escaped text in which **bold** and `code` mean what they do in Markdown."""
+    parts: list[str] = []
+    for number, part in enumerate(html.escape(text).split("`")):
+        bold = part.split("**")
+        parts.append(
+            f"<code>{part}</code>" if number % 2 else "".join(f"<b>{p}</b>" if i % 2 else p for i, p in enumerate(bold))
+        )
+    return "".join(parts)
+
+
+__all__ = ["ANSWERS", "Answer", "export", "report_blocks", "write_report"]

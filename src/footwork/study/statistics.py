@@ -1,0 +1,185 @@
+"""Statistics over seeds: what a few runs say, and how sure they are of it.
+
+Definitions are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
+Statistical Precipice" (2021): interquartile mean, stratified bootstrap, probability of
+improvement, performance profiles. Scores of one row of the table are an array [S] or
+[S, T]: S seeds, T strata (directions, tasks). Randomness is an argument, a numpy Generator.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Statistic = Callable[[Floats], Floats]  # of scores [draws, S, T], over the last two axes: [draws]
+
+DRAWS = 2000  # resamples of a bootstrap interval
+CONFIDENCE = 0.95
+
+
+class Effect(NamedTuple):
+    """A number with its 95 % interval."""
+
+    estimate: float
+    low: float
+    high: float
+
+
+def generator_for(name: str) -> np.random.Generator:
+    """A generator of its own for everything that has a name, the same in every process."""
+    return np.random.default_rng(zlib.crc32(name.encode()))
+
+
+def as_scores(values: npt.ArrayLike) -> Floats:
+    """Scores [S, T] from [S] or [S, T].
+
+    Raises:
+        ValueError: there are none, or one is not finite.
+    """
+    scores = np.asarray(values, np.float64)
+    scores = scores[:, None] if scores.ndim == 1 else scores
+    if scores.ndim != 2 or scores.size == 0:
+        raise ValueError(f"scores must be [seeds] or [seeds, strata] and not empty, got shape {scores.shape}")
+    if not np.isfinite(scores).all():
+        raise ValueError("scores must be finite")
+    return scores
+
+
+def iqm(scores: npt.ArrayLike, axis: int | None = None) -> Floats:
+    """Interquartile mean: of what is left when a quarter of the values is cut off at either end.
+
+    As many whole values are cut as fit into a quarter; below four values it is the mean.
+    """
+    values = np.asarray(scores, np.float64)
+    values, axis = (values.reshape(-1), 0) if axis is None else (values, axis)
+    cut = values.shape[axis] // 4
+    ordered = np.sort(values, axis=axis)
+    kept = np.take(ordered, range(cut, values.shape[axis] - cut), axis=axis)
+    return np.asarray(kept.mean(axis=axis))
+
+
+def overall_iqm(scores: Floats) -> Floats:
+    """The IQM over the last two axes."""
+    return iqm(scores.reshape(*scores.shape[:-2], -1), axis=-1)
+
+
+def spread(scores: Floats) -> Floats:
+    """Standard deviation across seeds [..., S, T], its square averaged over the strata."""
+    return np.sqrt(np.mean(np.var(scores, axis=-2, ddof=1 if scores.shape[-2] > 1 else 0), axis=-1))
+
+
+def resample(scores: Floats, draws: int, generator: np.random.Generator, together: bool = False) -> Floats:
+    """Bootstrap samples [draws, S, T] of scores [S, T]: seeds drawn with replacement.
+
+    Within each stratum on its own, as rliable does, or with ``together`` whole seeds, where the
+    strata of one seed depend on each other (four directions that were trained on one another's ants).
+    """
+    seeds, strata = scores.shape
+    chosen = generator.integers(0, seeds, (draws, seeds, 1 if together else strata))
+    return np.take_along_axis(scores[None], np.broadcast_to(chosen, (draws, seeds, strata)), axis=1)
+
+
+def percentile_interval(distribution: npt.ArrayLike, axis: int = 0) -> Floats:
+    """Bounds [2, ...] between which the middle 95 % of a bootstrap distribution lie."""
+    tail = 100 * (1 - CONFIDENCE) / 2
+    return np.asarray(np.percentile(np.asarray(distribution), (tail, 100 - tail), axis=axis))
+
+
+def contrast(
+    groups: Sequence[npt.ArrayLike],
+    weights: Sequence[float],
+    generator: np.random.Generator,
+    statistic: Statistic = overall_iqm,
+    draws: int = DRAWS,
+) -> Effect:
+    """A weighted sum of a statistic over groups of runs, with its stratified-bootstrap interval.
+
+    The groups (rows of the table) are the strata: each is resampled on its own, by whole
+    seeds. Weights (1, -1) make a difference, (1, -1, -1, 1) a difference of differences.
+
+    Args:
+        groups: scores [S] or [S, T] of each, as many seeds as there are.
+        weights: one per group.
+        generator: of the resamples.
+        statistic: over the last two axes.
+        draws: resamples.
+
+    Raises:
+        ValueError: a group is empty or not finite, or there are not as many weights as groups.
+    """
+    if len(groups) != len(weights) or not groups:
+        raise ValueError(f"as many weights as groups, got {len(weights)} and {len(groups)}")
+    scores = [as_scores(group) for group in groups]
+    estimate = sum(w * float(statistic(s)) for w, s in zip(weights, scores, strict=True))
+    samples = [statistic(resample(s, draws, generator, together=True)) for s in scores]
+    total = sum((w * s for w, s in zip(weights, samples, strict=True)), np.zeros(draws))
+    low, high = percentile_interval(total)
+    return Effect(float(estimate), float(low), float(high))
+
+
+def probability_of_improvement(one: npt.ArrayLike, other: npt.ArrayLike) -> float:
+    """Probability that a run of ``one`` scores higher than a run of ``other``, ties counted half, averaged over strata.
+
+    The Mann-Whitney U statistic divided by the number of pairs.
+
+    Raises:
+        ValueError: there are no scores, or different numbers of strata.
+    """
+    a, b = as_scores(one), as_scores(other)
+    if a.shape[1] != b.shape[1]:
+        raise ValueError(f"as many strata on both sides, got {a.shape[1]} and {b.shape[1]}")
+    pairs = a[:, None, :] - b[None, :, :]
+    return float(np.mean((pairs > 0) + 0.5 * (pairs == 0)))
+
+
+def performance_profile(scores: npt.ArrayLike, thresholds: npt.ArrayLike) -> Floats:
+    """Share of runs that score above each threshold (rliable's score distribution)."""
+    values = as_scores(scores).reshape(-1)
+    return np.asarray((values[:, None] > np.asarray(thresholds, np.float64)[None]).mean(axis=0))
+
+
+def curve_band(curves: npt.ArrayLike, generator: np.random.Generator, draws: int = DRAWS) -> tuple[Floats, Floats]:
+    """IQM over seeds of curves [S, X] and its interval [2, X]; a curve is drawn whole."""
+    values = np.asarray(curves, np.float64)
+    chosen = generator.integers(0, len(values), (draws, len(values)))
+    samples = iqm(values[chosen], axis=1)
+    return iqm(values, axis=0), percentile_interval(samples)
+
+
+def wilson(hits: int, count: int) -> tuple[float, float]:
+    """95 % interval of a rate (Wilson 1927).
+
+    Raises:
+        ValueError: not 0 <= hits <= count, or count is 0.
+    """
+    if count < 1 or not 0 <= hits <= count:
+        raise ValueError(f"0 <= hits <= count and count >= 1, got {hits} of {count}")
+    z, rate = 1.959964, hits / count
+    middle = (rate + z * z / (2 * count)) / (1 + z * z / count)
+    half = z / (1 + z * z / count) * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+__all__ = [
+    "CONFIDENCE",
+    "DRAWS",
+    "Effect",
+    "as_scores",
+    "contrast",
+    "curve_band",
+    "generator_for",
+    "iqm",
+    "overall_iqm",
+    "percentile_interval",
+    "performance_profile",
+    "probability_of_improvement",
+    "resample",
+    "spread",
+    "wilson",
+]

@@ -1,0 +1,118 @@
+"""Statistics against published values, against scipy, and against arithmetic done by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from footwork.study import statistics
+
+# The score matrices (runs x tasks) of rliable's own test, with the values published there.
+RLIABLE_X = np.array([[1, 2], [2, 2], [1, 1], [2, 1]])
+RLIABLE_Y = np.array([[1, 1], [2, 2], [3, 3]])
+
+
+def test_the_values_that_rliable_publishes():
+    assert statistics.iqm(RLIABLE_X) == 1.5
+    assert statistics.iqm(RLIABLE_Y) == 2
+    assert statistics.probability_of_improvement(RLIABLE_X, RLIABLE_Y) == pytest.approx(1 / 3)
+
+
+def test_iqm_cuts_a_quarter_at_either_end():
+    assert statistics.iqm([100.0, 1, 2, 3, 4, 5, 6, -50]) == pytest.approx((2 + 3 + 4 + 5) / 4)
+    assert statistics.iqm([1.0, 2, 6]) == 3  # below four values nothing is cut
+    np.testing.assert_array_equal(statistics.iqm([[0.0, 10], [1, 20], [2, 30], [900, -900]], axis=0), [1.5, 15])
+
+
+@given(hnp.arrays(np.float64, st.integers(1, 40), elements=st.floats(-1e3, 1e3)))
+def test_iqm_is_scipys_trimmed_mean(values):
+    assert statistics.iqm(values) == pytest.approx(scipy.stats.trim_mean(values, 0.25), abs=1e-9)
+
+
+@given(
+    hnp.arrays(np.int64, st.integers(1, 12), elements=st.integers(0, 5)),
+    hnp.arrays(np.int64, st.integers(1, 12), elements=st.integers(0, 5)),
+)
+def test_probability_of_improvement_is_mann_whitney(one, other):
+    expected = scipy.stats.mannwhitneyu(one, other, alternative="greater").statistic / (one.size * other.size)
+    found = statistics.probability_of_improvement(one, other)
+    assert found == pytest.approx(expected)
+    assert found + statistics.probability_of_improvement(other, one) == pytest.approx(1)
+
+
+def test_wilson_at_newcombes_published_examples():
+    """Newcombe, Statistics in Medicine 17 (1998), table I, method 3."""
+    for hits, count, low, high in [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ]:
+        assert statistics.wilson(hits, count) == pytest.approx((low, high), abs=5e-5)
+    with pytest.raises(ValueError, match="got 3 of 2"):
+        statistics.wilson(3, 2)
+
+
+def test_resamples_stay_in_their_stratum_and_may_keep_seeds_whole():
+    scores = np.array([[0.0, 10], [1, 11]])
+    apart = statistics.resample(scores, 4000, np.random.default_rng(0))
+    assert set(np.unique(apart[..., 0])) == {0, 1}
+    assert set(np.unique(apart[..., 1])) == {10, 11}
+    # The mean of two draws of {0, 1} is 0, 1/2 or 1 with probability 1/4, 1/2, 1/4.
+    np.testing.assert_allclose(
+        [(apart[..., 0].mean(axis=1) == value).mean() for value in (0, 0.5, 1)], (0.25, 0.5, 0.25), atol=0.03
+    )
+    whole = statistics.resample(scores, 100, np.random.default_rng(0), together=True)
+    np.testing.assert_array_equal(whole[..., 1] - whole[..., 0], 10)
+
+
+def test_a_difference_has_the_interval_that_scipy_finds():
+    key = np.random.default_rng(3)
+    one, other = key.normal(1.0, 1.0, 30), key.normal(0.0, 1.0, 25)
+    found = statistics.contrast([one, other], (1, -1), np.random.default_rng(1), draws=20_000)
+    mean = lambda a, b, axis: statistics.iqm(a, axis=axis) - statistics.iqm(b, axis=axis)  # noqa: E731
+    expected = scipy.stats.bootstrap(
+        (one, other), mean, vectorized=True, method="percentile", n_resamples=20_000, rng=np.random.default_rng(2)
+    ).confidence_interval
+    assert found.estimate == pytest.approx(float(statistics.iqm(one) - statistics.iqm(other)))
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=0.02)
+    again = statistics.contrast([one, other], (1, -1), np.random.default_rng(1), draws=20_000)
+    assert again == found  # the generator is all the randomness there is
+
+
+def test_a_difference_of_differences():
+    exact = statistics.contrast([[5.0] * 4, [1.0] * 4, [3.0] * 4, [2.0] * 4], (1, -1, -1, 1), np.random.default_rng(0))
+    assert exact == (3, 3, 3)
+
+
+def test_intervals_cover_as_often_as_they_say():
+    key, hits = np.random.default_rng(0), 0
+    for _ in range(300):
+        effect = statistics.contrast([key.normal(0, 1, 30)], (1,), key, draws=400)
+        hits += effect.low <= 0 <= effect.high
+    assert 0.90 <= hits / 300 <= 0.98
+
+
+def test_spread_is_within_strata():
+    assert statistics.spread(np.array([[0.0, 100], [2, 102]])) == pytest.approx(np.sqrt(2))
+    assert statistics.spread(np.array([[1.0], [3], [5]])) == pytest.approx(2)
+
+
+def test_profiles_and_bands():
+    np.testing.assert_array_equal(
+        statistics.performance_profile([0.1, 0.5, 0.9, 0.9], [0.0, 0.5, 0.89, 1]), [1, 0.5, 0.5, 0]
+    )
+    middle, (low, high) = statistics.curve_band([[0.0, 1], [0, 3], [0, 5]], np.random.default_rng(0))
+    np.testing.assert_array_equal(middle, [0, 3])
+    assert low[0] == high[0] == 0
+    assert 1 <= low[1] < 3 < high[1] <= 5
+
+
+@pytest.mark.parametrize(("values", "message"), [([], "not empty"), ([1.0, np.nan], "finite")])
+def test_scores_that_say_nothing_are_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        statistics.contrast([values], (1,), np.random.default_rng(0))

@@ -1,0 +1,385 @@
+"""The study's table, plan, results, claims, figures and report, on folders written in milliseconds."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from fake_study import fake_run, write
+from footwork.arena import MAZES
+from footwork.doors.cli import run
+from footwork.evaluate import Episodes
+from footwork.record import RunDir, RunError, read_metrics
+from footwork.study import claims, measure, plan, report, results
+from footwork.study.experiments import EXPERIMENTS, GRIDS, MAIN, find_row, match_rows
+from footwork.study.figures import FIGURES, draw_figures, find_figures
+from footwork.study.plan import FULL, QUICK, Study
+from footwork.study.statistics import Effect
+
+WALKERS = ("walker/plain", "walker/random-start", "walker/random-repeated", "walker/appropriate-bias")
+KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias")
+
+
+@pytest.fixture
+def study(tmp_path):
+    return Study(tmp_path / "runs")
+
+
+def fill(study, rows, seeds, **how):
+    for row in rows:
+        for seed in range(seeds):
+            fake_run(study, row, seed, **how)
+
+
+# ---------------------------------------------------------------- the table
+
+
+def test_grids_are_rows_that_differ_in_one_field():
+    for grid in GRIDS:
+        for row in grid.rows():
+            assert EXPERIMENTS[row.name] == row
+            assert row != MAIN[grid.base]
+        assert grid.base in grid.points().values()
+    points = next(grid for grid in GRIDS if grid.name == "ablation/maze/k").points()
+    assert [*points] == [10, 20, 50, 100, 200, 400]
+    assert find_row(points[100]).option_steps == 100
+    assert find_row("ablation/random-start/t/25").regulariser.steps == 25
+
+
+def test_rows_of_another_ant_stand_on_rows_of_that_ant():
+    row = find_row("light/maze/hrl/appropriate-bias")
+    assert row.task.robot.name == "light"
+    assert row.needs == "light/walker/appropriate-bias"
+    assert find_row(row.needs).needs == "light/walker/plain"
+
+
+def test_patterns_mean_rows():
+    assert match_rows(()) == list(EXPERIMENTS)
+    assert match_rows(["maze/flat/*"]) == [
+        f"maze/flat/{k}" for k in ("penalised", "free", "guided-penalised", "guided-free")
+    ]
+    with pytest.raises(ValueError, match=r"no row matches 'maze/fast/\*'; known rows: walker/\*, "):
+        match_rows(["maze/fast/*"])
+
+
+# ---------------------------------------------------------------- the plan
+
+
+def test_a_plan_makes_what_a_run_stands_on_first_and_every_row_before_the_second_seed(study):
+    jobs = plan.plan(study, ["maze/hrl/appropriate-bias", "walker/symmetric"], ["maze/hrl/appropriate-bias"])
+    first = [job.row for job in jobs if job.seed == 0]
+    assert first == ["walker/plain", "walker/appropriate-bias", "maze/hrl/appropriate-bias", "walker/symmetric"]
+    assert [job.seed for job in jobs] == sorted(job.seed for job in jobs)
+    seeds = {row: sum(job.row == row for job in jobs) for row in first}
+    assert seeds == {
+        "walker/plain": 10,
+        "walker/appropriate-bias": 10,
+        "maze/hrl/appropriate-bias": 10,
+        "walker/symmetric": 3,
+    }
+    assert {job.steps for job in jobs if job.row == "walker/plain"} == {4 * 1_998_848}
+    assert len(plan.plan(study, ["walker/plain"], [], seeds=2)) == 2
+    with pytest.raises(ValueError, match="seeds must be >= 1, got 0"):
+        plan.plan(study, ["walker/plain"], [], seeds=0)
+
+
+def test_the_quick_study_is_short_and_has_every_row_of_a_claim(tmp_path):
+    quick = Study(tmp_path, QUICK)
+    rows = plan.default_rows(QUICK, claims.rows_read())
+    assert set(claims.rows_read()) <= set(rows)
+    assert max(job.steps for job in plan.plan(quick, rows, claims.rows_read())) < 200_000
+    annealed = quick.row("walker/interleaved")
+    assert annealed.ppo.anneal_updates * annealed.ppo.batch_size == annealed.total_steps
+
+
+def test_a_folder_holds_one_study(tmp_path):
+    plan.mark(Study(tmp_path / "a", QUICK))
+    assert plan.read_mark(tmp_path / "a") == QUICK
+    with pytest.raises(RunError, match="holds the quick study, not the full one"):
+        plan.mark(Study(tmp_path / "a", FULL))
+    fake_run(Study(tmp_path / "b"), "walker/plain", 0)
+    with pytest.raises(RunError, match="not of the quick study"):
+        plan.mark(Study(tmp_path / "b", QUICK))
+    (tmp_path / "a" / plan.STUDY_FILE).write_text("{")
+    with pytest.raises(RunError, match=r"study\.json is damaged"):
+        plan.read_mark(tmp_path / "a")
+
+
+# ---------------------------------------------------------------- measurements
+
+
+def test_the_straight_line_of_the_u_maze_stops_at_its_wall():
+    np.testing.assert_allclose(measure.straight_line_stop(MAZES["u"]), (-4.0, -2.4), atol=0.02)
+    assert measure.straight_line_stop(find_row("bandit/flat/free").task.arena) is None
+
+
+def test_arrivals_by_hand():
+    """Four episodes in the U maze: in the goal, at the wall, at the wall after the goal, still at the start."""
+    ends = np.array([(-4.0, 4.0), (-4.0, -2.5), (-4.0, -2.5), (-4.0, -4.0)])
+    episodes = Episodes(
+        closest=np.array([0.1, 6.5, 0.4, 8.0]),
+        fallen=np.zeros(4, bool),
+        flipped=np.zeros(4, bool),
+        progress=np.zeros(4),
+        distance=np.zeros(4),
+        time_to_goal=np.array([10.0, np.nan, 20.0, np.nan]),
+        paths=np.stack([np.broadcast_to((-4.0, -4.0), (4, 2)), ends]),
+        choices=np.zeros((0, 4), np.int32),
+        ended=np.zeros((1, 4), bool),
+    )
+    found = measure.arrivals(find_row("maze/flat/free"), episodes)
+    assert found["way"] == pytest.approx((8 + 1.5 + 1.5 + 0) / 4 / 8)
+    assert found["stuck"] == 0.25
+    assert found["success"]["1.0"] == 0.5
+    assert found["time_to_goal_s"] == 15.0
+
+
+# ---------------------------------------------------------------- results
+
+
+def test_curves_are_the_runs_metrics_in_bins(study):
+    path = fake_run(study, "walker/plain", 0, lines=40)
+    run, experiment = RunDir(path), find_row("walker/plain")
+    curve = results.read_curve(run, experiment)
+    lines = read_metrics(run.metrics_path)
+    assert curve.step[-1] == run.summary()["steps"]
+    np.testing.assert_array_equal(curve.episodes.sum(axis=0), np.sum([line["episode/count"] for line in lines], axis=0))
+    late = lines[-4:]
+    counts = np.array([line["episode/count"] for line in late])
+    returns = np.nan_to_num(np.array([line["episode/return"] for line in late]))
+    np.testing.assert_allclose(
+        results.final(curve, "return"), (counts * returns).sum(axis=0) / counts.sum(axis=0), rtol=1e-4
+    )
+    run.metrics_path.unlink()  # what is kept of the curve is enough, and nearly the same
+    kept = results.read_curve(run, experiment)
+    np.testing.assert_allclose(kept.values["return"], curve.values["return"], rtol=1e-4)
+    (path / results.CURVE).unlink()
+    with pytest.raises(RunError, match=r"metrics\.jsonl is missing"):
+        results.read_curve(run, experiment)
+
+
+def test_what_does_not_count_is_left_out_by_name(study):
+    row = "maze/flat/free"
+    paths = [fake_run(study, row, seed) for seed in range(6)]
+    (paths[1] / "DONE").unlink()
+    config = json.loads((paths[2] / "config.json").read_text())
+    config["config"]["experiment"]["task"]["xy_scale"] = 0.5
+    write(paths[2] / "config.json", config)
+    write(paths[3] / "DONE", {"steps": 500_000})
+    config = json.loads((paths[4] / "config.json").read_text())
+    config["config"]["experiment"]["wings"] = 2
+    config["versions"]["footwork"] = "9.9"
+    write(paths[4] / "config.json", config)
+    shutil.copytree(paths[5], paths[5].with_name("seeds-5"))
+    found = results.Results(study)
+    assert [sample.seed for sample in found.samples(row)] == [0, 5]
+    for words in (
+        "seed-1 is not finished",
+        "seed-2 was trained with other fields than maze/flat/free",
+        "seed-3 is 500,000 steps long, maze/flat/free takes 9,998,336",
+        "seed-4 is of another version of footwork (9.9)",
+        f"seeds-5: seed 5 is in {paths[5]} too",
+    ):
+        assert any(words in problem for problem in found.problems), words
+    assert [sample.seed for sample in results.Results(study, any_length=True).samples(row)] == [0, 3, 5]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "is missing"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-20]), "is truncated or damaged"),
+        (lambda path: write(path, {**json.loads(path.read_text()), "format": 99}), "of another version"),
+        (lambda path: write(path, {**json.loads(path.read_text()), "steps": 1}), "is of a policy 1 steps old"),
+    ],
+)
+def test_damaged_measurements_are_named_and_how_to_make_them_again(study, damage, message):
+    path = fake_run(study, "maze/flat/free", 0)
+    damage(path / "evaluation.json")
+    found = results.Results(study)
+    assert len(found.scores("maze/flat/free", "way")) == 0
+    (problem,) = found.problems
+    assert message in problem
+    assert "footwork reproduce --rows maze/flat/free makes it again" in problem
+
+
+def test_truncated_metrics_are_named(study):
+    path = fake_run(study, "walker/plain", 0) / "metrics.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:-3]))
+    found = results.Results(study)
+    assert len(found.scores("walker/plain", "return")) == 0
+    assert any("metrics.jsonl is truncated" in problem for problem in found.problems)
+
+
+# ---------------------------------------------------------------- claims
+
+
+@pytest.mark.parametrize(
+    ("rule", "bound", "effect", "verdict"),
+    [
+        ("greater", 0.05, (0.2, 0.1, 0.3), "holds"),
+        ("greater", 0.05, (0.02, 0.01, 0.04), "does not hold"),
+        ("greater", 0.05, (0.04, 0.01, 0.07), "undecided"),
+        ("greater", 0.05, (0.2, -0.1, 0.5), "undecided"),
+        ("not worse", 0.05, (0.0, -0.04, 0.04), "holds"),
+        ("not worse", 0.05, (-0.2, -0.3, -0.1), "does not hold"),
+        ("not worse", 0.05, (-0.03, -0.06, 0.01), "undecided"),
+        ("same", 0.05, (0.0, -0.04, 0.04), "holds"),
+        ("same", 0.05, (0.2, 0.1, 0.3), "does not hold"),
+        ("same", 0.05, (0.04, -0.02, 0.1), "undecided"),
+        ("at least", 0.95, (0.97, 0.96, 0.98), "holds"),
+        ("at least", 0.95, (0.9, 0.88, 0.94), "does not hold"),
+        ("at most", 0.5, (0.4, 0.3, 0.5), "holds"),
+        ("at most", 0.5, (0.4, 0.3, 0.6), "undecided"),
+        ("at most", 0.5, (0.7, 0.6, 0.8), "does not hold"),
+    ],
+)
+def test_the_rules(rule, bound, effect, verdict):
+    assert claims.decide(rule, bound, Effect(*effect)) == verdict
+
+
+def test_claims_read_rows_that_exist_with_metrics_that_exist():
+    assert [claim.number for claim in claims.CLAIMS] == list(range(1, 16))
+    assert set(claims.rows_read()) <= set(MAIN)
+    for claim in claims.CLAIMS:
+        assert claims.settings_of(claim)
+        assert claim.min_seeds >= 10
+        for what in claim.contrasts:
+            assert what.metric in results.METRICS
+            assert len(what.rows) == len(what.weights)
+    everywhere = {claim.number for claim in claims.CLAIMS if claim.everywhere}
+    assert everywhere == {7, 8, 9, 10, 11, 12, 14}
+
+
+def verdicts(study, number):
+    found = results.Results(study)
+    return {j.where: j for j in claims.judge_all(found) if j.claim.number == number}
+
+
+def test_verdicts_need_ten_seeds_and_say_so(study):
+    rows = ("maze/paper/appropriate-bias", "maze/flat/free", "maze/flat/penalised")
+    fill(study, rows, 4)
+    where = "mujoco, heavy ant, the paper's reward and schedule"
+    few = verdicts(study, 2)[where]
+    assert few.verdict == "undecided"
+    assert few.why == "4 seeds, 10 are asked for; so far: holds"
+    for row in rows:
+        for seed in range(4, 10):
+            fake_run(study, row, seed)
+    enough = verdicts(study, 2)[where]
+    assert enough.verdict == "holds"
+    against_free = next(f for f in enough.findings if f.contrast.words == "against flat, free")
+    assert against_free.effect.low > 0.2
+    assert against_free.probability == 1.0
+    assert against_free.seeds == (10, 10)
+    assert verdicts(study, 2)[where] == enough  # the intervals are the same each time
+    missing = verdicts(study, 2)["mujoco, heavy ant, our reward and schedule"]
+    assert missing.verdict == "undecided"
+    assert "no runs of maze/hrl/appropriate-bias" in missing.why
+
+
+def test_verdicts_name_engine_and_ant_and_one_failing_comparison_is_enough(study):
+    fill(study, ("walker/appropriate-bias", "walker/random-start"), 10)
+    fill(study, ("walker/random-repeated",), 10, quality=0.8)
+    fill(study, ("light/walker/plain",), 10, quality=0.2)
+    assert verdicts(study, 10)["mujoco, heavy ant"].verdict == "does not hold"
+    light = verdicts(study, 12)["mujoco, light ant"]
+    assert light.verdict == "holds"
+    assert verdicts(study, 12)["mujoco, heavy ant"].why == "no runs of walker/plain"
+
+
+def test_a_claim_about_variance_compares_spreads(study):
+    for i, row in enumerate(WALKERS):
+        for seed in range(10):
+            fake_run(study, row, seed, quality=0.5 + (0.0 if i == 0 else 0.4 * (seed % 2) - 0.2))
+    found = verdicts(study, 6)["mujoco, heavy ant"]
+    assert found.verdict == "holds"
+    assert all(finding.probability > 0.7 for finding in found.findings)
+
+
+# ---------------------------------------------------------------- figures and the report
+
+
+def test_figures_are_drawn_from_files_alone(study, tmp_path):
+    rows = {row for figure in find_figures(["7", "11-handovers", "16", "17"]) for row in figure.rows}
+    fill(study, sorted(rows - {"walker/symmetric"}), 2)
+    found = results.Results(study)
+    names = ["3", "7", "11", "16", "17"]
+    drawn = draw_figures(found, find_figures(names), tmp_path / "once")
+    for one in drawn:
+        assert [path.suffix for path in one.files] == [".png", ".svg"]
+        assert all(path.stat().st_size > 5000 for path in one.files)
+    assert {d.figure.name: d.without for d in drawn}["11-handovers"] == ("walker/symmetric",)
+    (again,) = draw_figures(results.Results(study), find_figures(["7"]), tmp_path / "twice")
+    assert [path.read_bytes() for path in again.files] == [path.read_bytes() for path in drawn[1].files]
+
+
+def test_every_figure_is_drawn_where_there_is_nothing_yet(study, tmp_path):
+    study.runs.mkdir()
+    numbers = [int(figure.name.partition("-")[0]) for figure in FIGURES]
+    assert numbers == list(range(1, len(FIGURES) + 1))
+    assert [figure.paper for figure in FIGURES[:10]] == [f"Figure {i}" for i in range(1, 11)]
+    few = [figure for figure in FIGURES if figure.name in ("05-maze-reward", "12-switching", "14-regulariser-length")]
+    drawn = draw_figures(results.Results(study), few, tmp_path)
+    assert drawn[0].without == drawn[0].figure.rows
+
+
+def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(study, tmp_path, monkeypatch):
+    fill(study, (*WALKERS, "maze/flat/free"), 3)
+    (study.runs / "walker/plain/seed-2/DONE").unlink()
+    monkeypatch.setattr(report, "FIGURES", FIGURES[:2])
+    found = results.Results(study)
+    pages = report.write_report(found, tmp_path / "report", "footwork reproduce")
+    text, page = (path.read_text() for path in pages)
+    for words in (
+        "## Claims",
+        "## The paper, in its order",
+        "## Figures",
+        "## Rows",
+        "seed-2 is not finished",
+        "mujoco",
+    ):
+        assert words in text
+    assert text.index("## Claims") < text.index("## The paper") < text.index("## Figures")
+    assert not re.search(r'(src|href)="(?!data:)', page)  # nothing but what is in the page itself
+    assert page.count("data:image/png;base64,") == 2
+    assert all(f"| {claim.number} |" in text for claim in claims.CLAIMS)
+    kept = Study(tmp_path / "report/results")
+    assert not list(kept.runs.rglob("metrics.jsonl"))
+    again = claims.judge_all(results.Results(kept))
+    for one, other in zip(claims.judge_all(found), again, strict=True):
+        assert (one.verdict, one.why) == (other.verdict, other.why)
+        for a, b in zip(one.findings, other.findings, strict=True):
+            assert a.effect is b.effect is None or a.effect == pytest.approx(b.effect, rel=1e-3)
+
+
+def test_answers_name_claims_and_figures_that_exist():
+    assert {n for answer in report.ANSWERS for n in answer.claims} == {claim.number for claim in claims.CLAIMS}
+    assert {n for answer in report.ANSWERS for n in answer.figures} == set(range(1, len(FIGURES) + 1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["figures", "nope"], "unknown figure 'nope'; known figures: 01-walker, "),
+        (["figures", "--runs", ".", "--under", "feather"], "there are no rows under 'feather'"),
+        (["figures", "--runs", ".", "--under", "light"], "no finished runs under 'light'"),
+        (["figures", "--runs", "nowhere"], "there is no folder of runs at nowhere"),
+        (["report", "--runs", "nowhere"], "there is no folder of runs at nowhere"),
+        (["reproduce", "--rows", "maze/none"], "no row matches 'maze/none'"),
+        (["reproduce", "--launcher", "slurm", "--rows", "walker/plain"], "known launchers: local, ray"),
+        (["reproduce", "--seeds", "0"], "seeds must be >= 1"),
+        (["reproduce", "--workers", "-1", "--rows", "walker/plain"], "workers must be >= 0"),
+    ],
+)
+def test_bad_input_is_one_clear_line(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert run(arguments) == 1
+    captured = capsys.readouterr().err
+    assert message in captured
+    assert captured.count("\n") == 1

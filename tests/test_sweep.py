@@ -1,0 +1,224 @@
+"""The sweep: order, resuming, killing, failing; with runs that are copied from a shelf instead of trained."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from fake_study import fake_run
+from footwork.record import RunError
+from footwork.study import job, sweep
+from footwork.study.measure import measured
+from footwork.study.plan import FULL, Job, Study, plan
+from footwork.study.runs import run_path
+
+ROWS = ("walker/plain", "walker/appropriate-bias", "maze/hrl/appropriate-bias", "walker/symmetric")
+
+# In place of a training: begin in the run's place, take some time, and copy the finished run from the shelf.
+STAND_IN = """
+import json, os, pathlib, shutil, signal, sys, threading, time
+shelf, log, asked = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), json.loads(sys.argv[3])
+def watch():
+    while os.read(0, 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+threading.Thread(target=watch, daemon=True).start()
+place = f"{asked['row']}/seed-{asked['seed']}"
+with log.open("a") as file:
+    file.write(place + "\\n")
+trouble = shelf / "trouble.json"
+kind = json.loads(trouble.read_text()).get(place) if trouble.is_file() else None
+if kind == "fails":
+    print("ValueError: the ant has lost a leg", file=sys.stderr)
+    sys.exit(1)
+if kind == "killed once" and log.read_text().count(place) == 1:
+    os.kill(os.getpid(), signal.SIGKILL)
+target = pathlib.Path(asked["runs"]) / place
+target.mkdir(parents=True, exist_ok=True)
+shutil.copy(shelf / place / "config.json", target)
+time.sleep(float(os.environ.get("STAND_IN_SECONDS", "0.05")))
+shutil.copytree(shelf / place, target, dirs_exist_ok=True, ignore=shutil.ignore_patterns("DONE"))
+shutil.copy(shelf / place / "DONE", target)
+"""
+
+
+class Stage:
+    """A study to be made, the shelf of its finished runs, and the log of what was started."""
+
+    def __init__(self, path):
+        self.study, self.shelf, self.started_at = Study(path / "runs"), path / "shelf", path / "started.log"
+        self.jobs = plan(self.study, ROWS, [], seeds=2)
+        for one in self.jobs:
+            fake_run(Study(self.shelf), one.row, one.seed, lines=10)
+
+    def command(self, study, one, core):
+        asked = {"runs": str(study.runs), "row": one.row, "seed": one.seed}
+        return [sys.executable, "-c", STAND_IN, str(self.shelf), str(self.started_at), json.dumps(asked)]
+
+    def started(self):
+        return self.started_at.read_text().split() if self.started_at.is_file() else []
+
+    def trouble(self, **places):
+        (self.shelf / "trouble.json").write_text(json.dumps(places["places"]))
+
+    def run(self, **how):
+        self.said = []
+        return sweep.run_study(self.study, self.jobs, log=self.said.append, **how)
+
+
+@pytest.fixture
+def stage(tmp_path, monkeypatch):
+    stage = Stage(tmp_path)
+    monkeypatch.setattr(sweep, "job_command", stage.command)
+    monkeypatch.setattr(sweep, "POLL", 0.01)
+    return stage
+
+
+def test_everything_is_made_once_and_in_order(stage):
+    board = stage.run(workers=2)
+    assert (len(board.done), board.failed) == (8, {})
+    started = stage.started()
+    assert sorted(started) == sorted(f"{one.row}/seed-{one.seed}" for one in stage.jobs)
+    for one in stage.jobs:
+        if one.needs:
+            assert started.index(f"{one.needs}/seed-{one.seed}") < started.index(f"{one.row}/seed-{one.seed}")
+    again = stage.run(workers=2)
+    assert len(again.done) == 8
+    assert stage.started() == started  # nothing is made twice
+    shutil.rmtree(run_path(stage.study.runs, "walker/symmetric", (1,)))
+    stage.run()
+    assert stage.started()[8:] == ["walker/symmetric/seed-1"]
+
+
+def test_a_failure_is_reported_with_all_that_stood_on_it(stage):
+    stage.trouble(places={"walker/appropriate-bias/seed-1": "fails", "walker/symmetric/seed-0": "killed once"})
+    board = stage.run(workers=2)
+    assert len(board.done) == 6
+    reasons = {one.name: reason for one, reason in board.failed.items()}
+    assert "the ant has lost a leg" in reasons["walker/appropriate-bias seed 1"]
+    assert reasons["maze/hrl/appropriate-bias seed 1"] == "needs walker/appropriate-bias seed 1, which failed"
+    assert any("walker/symmetric seed 0: its process was ended" in line for line in stage.said)
+    assert sum("FAILED" in line for line in stage.said) == 2
+    stage.trouble(places={})
+    assert len(stage.run().done) == 8  # called again, it goes on
+
+
+def test_one_sweep_at_a_time(stage):
+    with sweep._only_one(stage.study.runs), pytest.raises(RunError, match="another footwork reproduce is at work"):
+        stage.run()
+
+
+KILLED = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_sweep import Stage
+from footwork.study import sweep
+class Again(Stage):
+    def __init__(self, path):
+        super().__init__(path) if not (path / "shelf").is_dir() else self.reuse(path)
+    def reuse(self, path):
+        from test_sweep import ROWS, Study, plan
+        self.study, self.shelf, self.started_at = Study(path / "runs"), path / "shelf", path / "started.log"
+        self.jobs = plan(self.study, ROWS, [], seeds=2)
+stage = Again(Path({path!r}))
+sweep.job_command, sweep.POLL = stage.command, 0.01
+stage.run(workers=2)
+"""
+
+
+def test_kill_minus_nine_of_the_sweep_loses_nothing(stage, tmp_path):
+    code = KILLED.format(tests=os.path.dirname(__file__), path=str(tmp_path))
+    environment = {**os.environ, "STAND_IN_SECONDS": "0.3"}
+    for kill in (1, 2):
+        process = subprocess.Popen([sys.executable, "-c", code], env=environment, start_new_session=True)
+        deadline = time.monotonic() + 60
+        while len(stage.started()) < 2 * kill and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        time.sleep(0.1 * kill)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        time.sleep(0.5)  # the runs see that they are alone, and end
+        finished = {str(done.parent.relative_to(stage.study.runs)) for done in stage.study.runs.rglob("DONE")}
+        before = stage.started()
+        assert all(before.count(place) >= 1 for place in finished)
+    done = {str(path.parent.relative_to(stage.study.runs)) for path in stage.study.runs.rglob("DONE")}
+    before = len(stage.started())
+    board = stage.run(workers=2)
+    assert (len(board.done), board.failed) == (8, {})
+    assert not done & set(stage.started()[before:])  # a finished run is not run again
+    for one in stage.jobs:
+        place = run_path(stage.study.runs, one.row, (one.seed,))
+        assert (place / "metrics.jsonl").read_bytes() == (
+            run_path(stage.shelf, one.row, (one.seed,)) / "metrics.jsonl"
+        ).read_bytes()
+
+
+def test_the_board_counts_steps_and_time(stage):
+    board = sweep.Board(stage.study, stage.jobs)
+    assert board.seconds_left() is None
+    one = stage.jobs[0]
+    place = run_path(stage.study.runs, one.row, (one.seed,))
+    place.mkdir(parents=True)
+    half = one.steps // 4 // 2
+    (place / "metrics.jsonl").write_text(json.dumps({"step": half}) + "\n" + '{"step": 1e9')  # the last line is torn
+    board.active.add(one)
+    assert board.steps_done() == pytest.approx(0.85 * one.steps / 2, rel=1e-6)
+    board.begun -= 100.0
+    left = sum(other.steps for other in stage.jobs) - board.steps_done()
+    assert board.seconds_left() == pytest.approx(left / (board.steps_done() / 100), rel=0.01)
+    assert sweep.board_table(board).row_count == 1
+    assert "0 of 8 runs done, 1 running" in board.line()
+
+
+def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
+    """What a job trains on, of a run with several seeds too; and that it measures what it trained."""
+    from footwork import checkpoint
+    from footwork.record import RunDir, config_to_json
+    from footwork.study.runs import NEEDED
+    from footwork.train import policy_meta
+    from test_train import tiny, untrained
+
+    size = FULL.__class__("full", 2, 1, 3, 4, 4, (1000,))
+    study = Study(tmp_path, size)
+    monkeypatch.setattr(Study, "row", lambda self, name: tiny(name))
+    walkers = untrained("walker/symmetric", (0, 1))
+    walkers.params["actor"]["output"]["bias"] = walkers.params["actor"]["output"]["bias"].at[1].set(0.25)
+    run = RunDir.create(
+        tmp_path / "walker/symmetric/seeds-0-1", {"experiment": config_to_json(walkers.experiment), "seeds": [0, 1]}
+    )
+    run.save_policy(walkers.params, policy_meta(walkers.experiment, (0, 1), 0))
+    run.finish({"steps": walkers.experiment.total_steps})
+    job.complete(study, "bandit/hrl/symmetric", 1)
+    master = RunDir.open_existing(run_path(tmp_path, "bandit/hrl/symmetric", (1,)))
+    arrays, meta = checkpoint.load_arrays(master.path / NEEDED)
+    assert meta["seeds"] == [1]
+    assert (arrays["actor/output/bias"] == 0.25).all()
+    assert measured(master, tiny("bandit/hrl/symmetric"), size)
+    (entry,) = json.loads((master.path / "evaluation.json").read_text())["by_seed"]
+    assert entry["seed"] == 1
+    assert len(entry["ends"]) == 3
+    with pytest.raises(RunError, match="needs walker/symmetric seed 2, which is not finished"):
+        job.complete(study, "bandit/hrl/symmetric", 2)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="ray is installed")
+def test_without_ray_the_extra_is_named(stage):
+    with pytest.raises(ImportError, match=r"pip install 'footwork\[ray\]'"):
+        stage.run(launcher="ray")
+
+
+def test_jobs_are_named_and_run_alone_on_one_thread(tmp_path):
+    one = Job("walker/plain", 3, None, 10)
+    assert one.name == "walker/plain seed 3"
+    environment = sweep.job_environment({"XLA_FLAGS": "--xla_foo=1"}, tmp_path)
+    assert environment["XLA_FLAGS"] == "--xla_foo=1 --xla_cpu_multi_thread_eigen=false"
+    assert environment["OMP_NUM_THREADS"] == "1"

@@ -113,6 +113,7 @@ def learning_curve(path: Path, metrics: list[dict[str, Any]], title: str) -> Pat
 
 
 def write(figure: Any, path: Path) -> Path:
+    """Save a figure and let go of it; its directory is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)

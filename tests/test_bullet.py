@@ -25,7 +25,7 @@ from footwork.options import SubPolicies
 from footwork.record import RunDir, RunError, read_metrics
 from footwork.robot import ROBOTS
 from footwork.rotations import quaternion_to_matrix
-from footwork.study.experiments import ANT_WALKER, EXPERIMENTS, with_engine
+from footwork.study.experiments import ANT_WALKER, EXPERIMENTS, find_row, with_engine, with_robot
 from footwork.study.runs import find_trained, train_row
 from footwork.train import Interrupted, build_environment
 from footwork.types import PhysicsState
@@ -345,9 +345,13 @@ def test_walls_hold(bullet):
 
 
 @pytest.mark.parametrize("robot", ["bullet", "light", "stiff"])
-def test_other_ants_are_refused(robot):
-    with pytest.raises(ValueError, match=f"engine bullet has PyBullet's own ant, robot 'heavy': '{robot}' differs in"):
+def test_other_ants_are_refused(tmp_path, robot):
+    message = f"engine bullet has PyBullet's own ant, robot 'heavy': '{robot}' differs in"
+    with pytest.raises(ValueError, match=message):
         BulletPhysics(ROBOTS[robot], open_field(), 1, 1)
+    with pytest.raises(ValueError, match=message):
+        train_row(with_robot(find_row("bullet/walker/plain"), ROBOTS[robot]), (0,), tmp_path)
+    assert not list(tmp_path.iterdir())  # a refusal leaves nothing behind
 
 
 def test_what_is_out_of_range_is_refused():

@@ -327,7 +327,7 @@ def _played_on(trained: Trained, engine: str | None) -> Trained:
     from footwork.physics import require_engine
 
     experiment = trained.experiment if engine is None else replace(trained.experiment, engine=engine)
-    require_engine(experiment.engine)
+    require_engine(experiment.engine, experiment.task.robot)
     return trained._replace(experiment=experiment)
 
 

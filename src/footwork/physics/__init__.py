@@ -42,17 +42,20 @@ def check_engine(name: str) -> None:
         raise ValueError(f"unknown engine {name!r}; known engines: {', '.join(ENGINES)}")
 
 
-def require_engine(name: str) -> None:
-    """Refuse, before anything was begun, an engine that does not exist or is not installed.
+def require_engine(name: str, robot: Robot | None = None) -> None:
+    """Refuse, before anything was begun, an engine that does not exist, is not installed or has no such ant.
 
     Raises:
-        ValueError: there is no such engine.
+        ValueError: there is no such engine, or its module's ``check_robot`` refuses the ant.
         ImportError: its library is missing; names the extra that brings it.
     """
     check_engine(name)
     engine = ENGINES[name]
     if engine.library and find_spec(engine.library) is None:
         raise ImportError(f"engine {name} needs an extra: pip install 'footwork[{engine.module}]'")
+    check_robot = getattr(import_module(f"footwork.physics.{engine.module}"), "check_robot", None)
+    if robot is not None and check_robot is not None:
+        check_robot(robot)
 
 
 def physics_for(engine: str, robot: Robot, arena: Arena, num_envs: int, num_threads: int = 0) -> Physics:
@@ -69,6 +72,6 @@ def physics_for(engine: str, robot: Robot, arena: Arena, num_envs: int, num_thre
         ValueError: there is no such engine, or it has no such ant.
         ImportError: the engine's library is missing; names the extra that brings it.
     """
-    require_engine(engine)
+    require_engine(engine, robot)
     home = import_module(f"footwork.physics.{ENGINES[engine].module}")
     return getattr(home, ENGINES[engine].factory)(robot, arena, num_envs, num_threads)

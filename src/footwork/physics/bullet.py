@@ -18,6 +18,7 @@ import tempfile
 import weakref
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -76,7 +77,7 @@ class BulletPhysics:
             raise ValueError(f"num_envs must be >= 1, got {num_envs}")
         if num_workers < 0:
             raise ValueError(f"num_workers must be >= 0, got {num_workers}")
-        _check_robot(robot)
+        check_robot(robot)
         num_workers = min(num_workers or _num_cores(), num_envs)
         _check_room(num_envs, num_workers)
         self.control_dt = robot.control_dt
@@ -171,8 +172,12 @@ class BulletPhysics:
 OriginalEnvPhysics = partial(BulletPhysics, original_env=True)
 
 
-def _check_robot(robot: Robot) -> None:
-    """Refuse an ant that PyBullet would silently not be."""
+def check_robot(robot: Robot) -> None:
+    """Refuse an ant that PyBullet would silently not be.
+
+    Raises:
+        ValueError: names a field that differs from PyBullet's ant.
+    """
     nominal = replace(HEAVY, **{name: getattr(robot, name) for name in _NOT_ITS_OWN})
     other = [name for name in robot.__dataclass_fields__ if getattr(robot, name) != getattr(nominal, name)]
     if other:
@@ -264,7 +269,13 @@ def serve() -> None:
     commands, answers = os.fdopen(os.dup(0), "rb", 0), os.fdopen(os.dup(1), "wb", 0)
     nowhere = os.open(os.devnull, os.O_RDWR)
     os.dup2(nowhere, 0)
-    os.dup2(nowhere, 1)  # PyBullet prints as it pleases
+    os.dup2(nowhere, 1)  # PyBullet prints as it pleases, and on stderr when it is imported
+    errors = os.dup(2)
+    os.dup2(nowhere, 2)
+    try:
+        import_module("pybullet")
+    finally:
+        os.dup2(errors, 2)
     num_envs = settings["num_envs"]
     shared = _Shared.over(mmap.mmap(settings["file"], _Shared.size(num_envs)), num_envs)
     own = range(settings["worker"], num_envs, settings["num_workers"])
@@ -314,7 +325,7 @@ class World:
     """
 
     def __init__(self, settings: dict[str, Any]) -> None:
-        import pybullet  # prints a line, so not before somebody wants it
+        import pybullet
 
         self._bullet = pybullet
         self._settings = settings

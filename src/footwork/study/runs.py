@@ -85,7 +85,7 @@ def train_row(
         CheckpointError: a checkpoint is damaged, or the disk is full.
     """
     _check_seeds(seeds)
-    require_engine(experiment.engine)
+    require_engine(experiment.engine, experiment.task.robot)
     path = path_of_new_run(runs, experiment, seeds) if name is None else runs / experiment.name / name
     config = {"experiment": config_to_json(experiment), "seeds": list(seeds)}
     if resume and (path / "config.json").is_file():

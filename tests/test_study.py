@@ -195,6 +195,10 @@ def test_what_does_not_count_is_left_out_by_name(study):
         (lambda path: path.write_bytes(path.read_bytes()[:-20]), "is truncated or damaged"),
         (lambda path: write(path, {**json.loads(path.read_text()), "format": 99}), "of another version"),
         (lambda path: write(path, {**json.loads(path.read_text()), "steps": 1}), "is of a policy 1 steps old"),
+        (
+            lambda path: write(path, {**json.loads(path.read_text()), "row": "maze/flat/penalised"}),
+            "the run is of maze",
+        ),
     ],
 )
 def test_damaged_measurements_are_named_and_how_to_make_them_again(study, damage, message):
@@ -205,6 +209,18 @@ def test_damaged_measurements_are_named_and_how_to_make_them_again(study, damage
     (problem,) = found.problems
     assert message in problem
     assert "footwork reproduce --rows maze/flat/free makes it again" in problem
+
+
+def test_mixed_runs_are_named(study):
+    paths = [fake_run(study, "maze/flat/free", seed) for seed in range(2)]
+    config = json.loads((paths[0] / "config.json").read_text())
+    config["versions"]["mujoco"] = "3.3.0"
+    write(paths[0] / "config.json", config)
+    shutil.copy(paths[0] / "evaluation.json", paths[1])
+    found = results.Results(study)
+    assert len(found.scores("maze/flat/free", "way")) == 1
+    assert any("different versions of mujoco: 3.3.0, " in problem for problem in found.problems)
+    assert any("says nothing of seed 1" in problem for problem in found.problems)
 
 
 def test_truncated_metrics_are_named(study):

@@ -53,6 +53,8 @@ def problem_with(run: RunDir, name: str, size: Size | None = None) -> str | None
         return f"{path} is truncated or damaged"
     if not isinstance(content, dict) or content.get("format") != FORMAT or not content.get("by_seed"):
         return f"{path} is damaged or of another version of footwork"
+    if content.get("row") != run.summary().get("row"):
+        return f"{path} is of {content.get('row')}, the run is of {run.summary().get('row')}"
     if content.get("steps") != run.summary().get("steps"):
         return f"{path} is of a policy {content.get('steps')} steps old, the run has {run.summary().get('steps')}"
     if size is not None and content.get("size") != size.name:

@@ -59,7 +59,7 @@ class Size:
 
 
 FULL = Size("full", 10, 3, 200, 64, 128, SWITCHING_PERIODS)
-QUICK = Size("quick", 2, 1, 32, 16, 32, (50, 200), short=(20_480, 40_960, 38_400, 40_960))
+QUICK = Size("quick", 2, 1, 16, 8, 16, (50,), short=(12_288, 24_576, 25_600, 20_480))
 SIZES = {size.name: size for size in (FULL, QUICK)}
 
 

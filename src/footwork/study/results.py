@@ -77,7 +77,7 @@ class Results:
         if row not in self._samples:
             found, problems = find_samples(self.study, row, self.any_length)
             self._samples[row] = found
-            self.problems.update(dict.fromkeys(problems))
+            self.problems.update(dict.fromkeys([*problems, *_mixed_versions(row, found)]))
         return self._samples[row]
 
     def curves(self, row: str) -> list[tuple[Sample, Curve]]:
@@ -126,7 +126,10 @@ class Results:
             if problem:
                 self.problems[f"{problem}: footwork reproduce --rows {sample.row} makes it again"] = None
             self._files[key] = [] if problem else json.loads((sample.run.path / name).read_bytes())["by_seed"]
-        return next((entry for entry in self._files[key] if entry["seed"] == sample.seed), None)
+        found = next((entry for entry in self._files[key] if entry["seed"] == sample.seed), None)
+        if found is None and self._files[key]:
+            self.problems[f"{sample.run.path / name} says nothing of seed {sample.seed}"] = None
+        return found
 
 
 def find_samples(study: Study, row: str, any_length: bool = False) -> tuple[tuple[Sample, ...], list[str]]:
@@ -157,6 +160,16 @@ def find_samples(study: Study, row: str, any_length: bool = False) -> tuple[tupl
                 continue
             found[seed] = Sample(row, seed, run, index, saved)
     return tuple(found[seed] for seed in sorted(found)), problems
+
+
+def _mixed_versions(row: str, samples: tuple[Sample, ...]) -> list[str]:
+    """Runs of one row that other libraries made count all the same; it is said."""
+    problems = []
+    for library in ("jax", "mujoco"):
+        found = sorted({str(sample.run.versions().get(library, "unknown")) for sample in samples})
+        if len(found) > 1:
+            problems.append(f"runs of {row} were made with different versions of {library}: {', '.join(found)}")
+    return problems
 
 
 def _saved(run: RunDir) -> tuple[Experiment, list[int]]:

@@ -111,7 +111,8 @@ class Env:
         else:
             held = np.asarray(state.held)
             moved = self.physics.step(physics, state.action, ~held if held.any() else None)
-        return state._replace(physics=moved, previous=state.physics, stale=jnp.zeros_like(state.stale))
+        xp = jnp if self.physics.traceable else np  # outside jit, an operation of JAX costs as much as 10 ants
+        return state._replace(physics=moved, previous=state.physics, stale=xp.zeros(self.num_envs, bool))
 
     def finish(self, state: EnvState, key: Key) -> tuple[EnvState, TimeStep]:
         """Reward and end of the step; a held row earns nothing and ends nothing."""

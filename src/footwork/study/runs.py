@@ -169,19 +169,33 @@ def packaged(row: str) -> Traversable:
 
 
 def find_trained(row: str, runs: Path) -> Trained:
-    """What a row name means: its newest finished run, else its packaged weights.
+    """What a row name means: its newest finished run, else its packaged weights. Or the run in that folder.
 
     Raises:
-        ValueError: the row is unknown.
-        RunError: it is known, and there is neither.
+        ValueError: it is neither a row nor the folder of a run.
+        RunError: it is a row, and there is neither; or the run in the folder is not finished.
         CheckpointError: what was found is damaged.
     """
+    run = _run_at(row)
+    if run is not None:
+        if not run.finished:
+            raise RunError(f"{row} holds an unfinished run")
+        return load_run(run)
     find_row(row)
     for run in finished_runs(row, runs):
         return load_run(run)
     if packaged(row).is_file():
         return _load_packaged(row)
     raise RunError(f"no finished run of {row} in {runs} and none in the package: footwork train {row}")
+
+
+def _run_at(address: str) -> RunDir | None:
+    """The run in the folder of that path, unless it is a row's address."""
+    try:
+        find_row(address)
+    except ValueError:
+        return RunDir(Path(address)) if (Path(address) / "config.json").is_file() else None
+    return None
 
 
 def _load_packaged(row: str) -> Trained:

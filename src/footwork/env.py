@@ -167,8 +167,8 @@ class Env:
         else:
             held = np.asarray(state.held)
             moved = self.physics.step(physics, state.action, ~held if held.any() else None)
-        none: Any = np.zeros(self.num_envs, bool)
-        return state._replace(physics=moved, previous=before, stale=none)
+        xp = jnp if self.physics.traceable else np  # outside jit, an operation of JAX costs as much as 10 ants
+        return state._replace(physics=moved, previous=before, stale=xp.zeros(self.num_envs, bool))
 
     def finish(self, state: EnvState, key: Key) -> tuple[EnvState, TimeStep]:
         """Reward and end of the step; a held row earns nothing and ends nothing."""

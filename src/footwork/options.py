@@ -33,19 +33,26 @@ class SubPolicies:
     deterministic: bool = False
 
     def act(self, obs: Float[Array, "N D"], direction: Int[Array, " N"], key: Key) -> Float[Array, "N 8"]:
-        """Each row's action by the sub-policy of its direction, from the first 32 numbers alone."""
+        """Each row's action by the sub-policy of its direction, from the first 32 numbers alone.
+
+        ``key`` is one for all rows, or one for each, [N]: a row then draws what it would draw alone.
+        """
         obs = obs[:, :WALKER_OBS_SIZE]
         if self.symmetric:
             action = self._act(self.params, turn_observation(obs, direction), key)
             return turn_action(action, -direction)
         num_directions = jax.tree.leaves(self.params)[0].shape[0]
-        keys = jax.random.split(key, num_directions)
-        actions = jax.vmap(self._act, in_axes=(0, None, 0))(self.params, obs, keys)
+        if key.ndim:  # a row's directions may share a key: only one of them is used
+            actions = jax.vmap(self._act, in_axes=(0, None, None))(self.params, obs, key)
+        else:
+            actions = jax.vmap(self._act, in_axes=(0, None, 0))(self.params, obs, jax.random.split(key, num_directions))
         return actions[direction, jnp.arange(obs.shape[0])]
 
     def _act(self, params: Params, obs: Array, key: Key) -> Array:
         if self.deterministic:
             return self.policy.mode(params, obs)
+        if key.ndim:
+            return jax.vmap(self.policy.act, in_axes=(None, 0, 0))(params, obs, key)[0]
         return self.policy.act(params, obs, key)[0]
 
 
@@ -104,7 +111,7 @@ class Options:
         return state._replace(choice=action, total=nothing._replace(events=far))
 
     def simulate(self, state: OptionsState, key: Key) -> OptionsState:
-        """Run the option."""
+        """Run the option; ``key`` is one for all rows, or one for each, [N]."""
         state, _ = scan_over(self.physics)(partial(self._control_step, key), state, np.arange(self.option_steps))
         return state
 
@@ -126,15 +133,21 @@ class Options:
 
 @host_jit
 def _option_begin(env: Options, state: OptionsState, key: Key, i: Int[Array, ""]) -> OptionsState:
-    act_key, begin_key = jax.random.split(jax.random.fold_in(key, 2 * i))
+    split = jax.vmap(jax.random.split, out_axes=1) if key.ndim else jax.random.split
+    act_key, begin_key = split(_fold(key, 2 * i))
     action = env.sub_policies.act(state.obs, state.choice, act_key)
     return state._replace(inner=env.inner.begin(state.inner, action, begin_key))
 
 
 @host_jit
 def _option_finish(env: Options, state: OptionsState, key: Key, i: Int[Array, ""]) -> OptionsState:
-    inner, step = env.inner.finish(state.inner, jax.random.fold_in(key, 2 * i + 1))
+    inner, step = env.inner.finish(state.inner, _fold(key, 2 * i + 1))
     return state._replace(inner=inner, obs=step.obs, total=accumulate(state.total, step))
+
+
+def _fold(key: Key, number: Int[Array, ""]) -> Key:
+    """``fold_in`` of one key, or of each in [N]."""
+    return jax.vmap(jax.random.fold_in, in_axes=(0, None))(key, number) if key.ndim else jax.random.fold_in(key, number)
 
 
 def accumulate(total: TimeStep, step: TimeStep) -> TimeStep:

@@ -81,7 +81,7 @@ def play_episodes(
     """Play ``num_episodes`` episodes of one seed's policy, all at once."""
     experiment = trained.experiment
     env = evaluation_environment(experiment, num_episodes, sub_policies, num_threads)
-    act = _actor(trained, seed_index, env, deterministic)
+    act = actor(trained, seed_index, env, deterministic)
     stride = experiment.option_steps if experiment.is_master else 1
     num_decisions = math.ceil(experiment.task.episode_steps / stride)
     key = jax.random.key(seed)
@@ -96,7 +96,7 @@ def play_episodes(
                 break
             state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
             state = env.simulate(state, simulate_key)
-            state, step = _finish(env, state, finish_key)
+            state, step = finish_step(env, state, finish_key)
             obs = step.obs
             keep = (step.events, step.terms["progress"], action if experiment.is_master else ())
             steps.append(jax.tree.map(np.asarray, keep))
@@ -120,7 +120,7 @@ def play_episodes(
     )
 
 
-def _actor(trained: Trained, seed_index: int, env: Environment, deterministic: bool) -> Any:
+def actor(trained: Trained, seed_index: int, env: Environment, deterministic: bool) -> Any:
     """The jitted first call of a step: the policy under test, and the environment's begin."""
     params = jax.tree.map(lambda leaf: leaf[seed_index], trained.params)
     experiment = trained.experiment
@@ -147,7 +147,8 @@ def _choose(policy: Policy, params: Params, deterministic: bool, obs: Array, key
 
 
 @partial(jax.jit, static_argnums=0)
-def _finish(env: Environment, state: Any, key: Key) -> Any:
+def finish_step(env: Environment, state: Any, key: Key) -> Any:
+    """The jitted second call of a step."""
     return env.finish(state, key)
 
 
@@ -261,7 +262,7 @@ class _Walk:
         """One segment: the state after it and what was counted."""
         begin, simulate, finish = split_phases(jax.random.fold_in(self.key, 1 + segment))
         state = self.env.simulate(self.env.begin(state, jnp.asarray(choice), begin), simulate)
-        state, step = _finish(self.env, state, finish)
+        state, step = finish_step(self.env, state, finish)
         return state, step.events
 
 
@@ -406,9 +407,11 @@ def transitions(
 
 __all__ = [
     "Episodes",
+    "actor",
     "bootstrap_mean",
     "evaluate",
     "evaluation_environment",
+    "finish_step",
     "handover_matrix",
     "play_episodes",
     "random_switching",

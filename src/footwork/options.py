@@ -112,10 +112,11 @@ class Options:
 
     def simulate(self, state: OptionsState, key: Key) -> OptionsState:
         """Run the option; ``key`` is one for all rows, or one for each, [N]."""
-        state, _ = scan_over(self.physics)(partial(self._control_step, key), state, np.arange(self.option_steps))
+        state, _ = scan_over(self.physics)(partial(self.control_step, key), state, np.arange(self.option_steps))
         return state
 
-    def _control_step(self, key: Key, state: OptionsState, i: Int[Array, ""]) -> tuple[OptionsState, None]:
+    def control_step(self, key: Key, state: OptionsState, i: Int[Array, ""]) -> tuple[OptionsState, None]:
+        """Control step ``i`` of the option: what :meth:`simulate` runs k of, for those who want to see each."""
         state = _option_begin(self, state, key, i)
         state = state._replace(inner=self.inner.simulate(state.inner, key))
         return _option_finish(self, state, key, i), None

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from footwork.train import Experiment, Trained
 
 RowName = Annotated[str, tyro.conf.Positional]
+RowNames = Annotated[tuple[str, ...], tyro.conf.Positional]
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,40 @@ class Quickstart:
     seed: int = 0
     steps: int | None = None  # control steps; default: the quickstart's own
     threads: int = 0  # of the physics; 0: all cores. Changes no number
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Write an HTML page that shows the ant in 3-D: play, scrub, follow. It opens from disk and fetches nothing."""
+
+    rows: RowNames  # rows or run directories; several are shown side by side
+    to: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("ant.html")  # the page
+    runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
+    episodes: int = 1  # of each row; of sub-policies, in each direction
+    seed: int = 0  # of the episodes
+    steps: int | None = None  # control steps to show of each episode; default: all
+    deterministic: bool = False  # act by the mode of the distribution instead of a sample
+    threads: int = 0  # of the physics; 0: all cores. Changes no number
+
+
+@dataclass(frozen=True)
+class Video:
+    """Write a video of the ant: .mp4 (extra footwork[video]), .webp or .gif."""
+
+    rows: RowNames  # rows or run directories; several are shown side by side
+    to: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("ant.webp")  # the file; its ending says which kind
+    runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
+    episodes: int = 1  # of each row, side by side; of sub-policies, in each direction
+    seed: int = 0  # of the episodes
+    steps: int | None = None  # control steps to show of each episode; default: all
+    deterministic: bool = False  # act by the mode of the distribution instead of a sample
+    threads: int = 0  # of the physics; 0: all cores. Changes no number
+    camera: Literal["follow", "arena", "above"] = "follow"
+    width: int = 640  # px, of each episode
+    height: int = 480  # px
+    fps: int = 30
+    speed: float = 1.0  # seconds of the ant per second of video
+    quality: int = 80  # 1..100
 
 
 @dataclass(frozen=True)
@@ -177,7 +212,9 @@ def _processor() -> str:
 
 def run(arguments: list[str]) -> int:
     """Run one command; what a user can mend is one line on stderr and exit status 1, 130 for an interrupt."""
-    commands: Any = List | Train | Evaluate | Transitions | Quickstart | Bench | Reproduce | Figures | Report
+    commands: Any = (
+        List | Train | Evaluate | Transitions | Quickstart | Replay | Video | Bench | Reproduce | Figures | Report
+    )
     chosen, rest = tyro.cli(commands, args=arguments, prog="footwork", return_unknown_args=True)
     if rest and not isinstance(chosen, Train):
         print(f"footwork: unknown options: {' '.join(rest)}; see footwork {arguments[0]} --help", file=sys.stderr)
@@ -188,6 +225,8 @@ def run(arguments: list[str]) -> int:
         Evaluate: _evaluate,
         Transitions: _transitions,
         Quickstart: _quickstart,
+        Replay: _replay,
+        Video: _video,
         Bench: _bench,
         Reproduce: _reproduce,
         Figures: _figures,
@@ -371,6 +410,45 @@ def _report(command: Report, rest: list[str]) -> int:
     from footwork.doors import study
 
     return study.report(command.runs, command.to, command.any_length)
+
+
+def _replay(command: Replay, rest: list[str]) -> int:
+    from footwork.doors.replay import replay
+
+    page = replay(
+        *command.rows,
+        episodes=command.episodes,
+        seed=command.seed,
+        runs=command.runs,
+        deterministic=command.deterministic,
+        most_steps=command.steps,
+        num_threads=command.threads,
+    )
+    path = page.save(command.to)
+    steps = sum(episode.num_steps for episode in page.footage)
+    print(f"wrote {path}: {len(page.footage)} episodes, {steps} control steps, {path.stat().st_size / 1e6:.2f} MB")
+    return 0
+
+
+def _video(command: Video, rest: list[str]) -> int:
+    from footwork.doors.replay import replay
+    from footwork.doors.video import Look, check_suffix, video
+
+    check_suffix(command.to.suffix)  # before the work
+    look = Look(command.width, command.height, command.fps, command.speed, command.camera, command.quality)
+    filmed = replay(
+        *command.rows,
+        episodes=command.episodes,
+        seed=command.seed,
+        runs=command.runs,
+        deterministic=command.deterministic,
+        most_steps=command.steps,
+        num_threads=command.threads,
+    )
+    say: Callable[[str], None] = lambda line: print(f"footwork: {line}", file=sys.stderr)  # noqa: E731
+    path = video(filmed.footage, command.to.suffix, look, say).save(command.to)
+    print(f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB")
+    return 0
 
 
 def _at_least_one(name: str, value: int) -> None:

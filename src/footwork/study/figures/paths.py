@@ -20,11 +20,9 @@ from footwork.evaluate import Episodes
 from footwork.study.experiments import find_row
 from footwork.study.figures.style import empty
 from footwork.study.measure import EVALUATION, STUCK_WITHIN, straight_line_stop
+from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR, GOAL_COLOUR
 from footwork.study.results import Results
 
-# Okabe and Ito's palette: right, up, left, down
-DIRECTION_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
-FLAT_COLOUR = "#7A7A7A"
 _WALL_COLOUR = "#4A4E57"
 
 
@@ -34,7 +32,7 @@ def _draw_arena(axes: Any, arena: Arena, goal_radius: float | None) -> None:
         axes.add_patch(Rectangle(corner, 2 * wall.half_x, 2 * wall.half_y, color=_WALL_COLOUR, lw=0))
     axes.plot(*arena.start, marker="o", ms=7, mfc="white", mec="black", zorder=5)
     for goal in arena.goals:
-        axes.add_patch(Circle(goal, goal_radius or 0.5, fc="#D55E00", ec="black", alpha=0.85, zorder=5))
+        axes.add_patch(Circle(goal, goal_radius or 0.5, fc=GOAL_COLOUR, ec="black", alpha=0.85, zorder=5))
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.set_xlabel("x (m)")
@@ -79,7 +77,7 @@ def paths_figure(
     ]
     handles += [
         Line2D([], [], marker="o", ls="", mfc="white", mec="black", label="start"),
-        Line2D([], [], marker="o", ls="", mfc="#D55E00", mec="black", ms=9, label="goal"),
+        Line2D([], [], marker="o", ls="", mfc=GOAL_COLOUR, mec="black", ms=9, label="goal"),
     ]
     figure.legend(handles=handles, loc="lower center", ncols=6, frameon=False, fontsize=9)
     if note:

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Polygon
 
 from footwork.arena import DIRECTIONS, Arena, bandit
 from footwork.study.experiments import ANT_MAZE
-from footwork.study.figures.paths import DIRECTION_COLOURS
+from footwork.study.palette import DIRECTION_COLOURS
 from footwork.study.results import Results
 
 _LEGS = ((1, 1), (-1, 1), (-1, -1), (1, -1))  # as in assets/ant.xml

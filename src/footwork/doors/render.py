@@ -1,0 +1,323 @@
+"""Pictures of filmed episodes: by MuJoCo's renderer where OpenGL works without a screen, else drawn from above.
+
+A painter is made for one episode and paints the moment after any control step:
+``paint(step) -> [height, width, 3] uint8``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+from functools import cache
+from itertools import pairwise
+from typing import Any, Literal, Protocol
+
+import mujoco
+import numpy as np
+from PIL import Image, ImageDraw
+
+from footwork.doors.replay import extent
+from footwork.footage import Footage
+from footwork.physics.mjcf import build_spec
+from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR, GOAL_COLOUR, rgb
+
+CameraName = Literal["follow", "arena", "above"]
+PLATFORMS = ("egl", "osmesa")  # OpenGL without a screen: on a driver, and in software
+
+_SHIN = (0.27, 0.29, 0.33)
+_BACKGROUND = (0.955, 0.95, 0.935)
+_WALL = (0.68, 0.69, 0.72)
+_WALL_HEIGHT = 0.5  # m, as drawn: walls of 2 m would hide the ant
+_MARGIN = 0.6  # m
+_FOLLOW_DISTANCE = 8.0  # m
+_PATH_HALF_WIDTH = 0.06  # m
+_CURVE_STEPS = 4  # control steps per piece of a drawn path
+
+
+class Painter(Protocol):
+    """Paints one episode."""
+
+    def paint(self, step: int) -> np.ndarray:
+        """The moment after ``step`` control steps, [height, width, 3] uint8."""
+
+    def close(self) -> None:
+        """Give back what the renderer holds."""
+
+
+def painter(footage: Footage, width: int, height: int, camera: CameraName, platform: str | None) -> Painter:
+    """The painter of an episode on an OpenGL platform, or the one that needs none."""
+    if platform is None:
+        return SketchPainter(footage, width, height, camera)
+    return GLPainter(footage, width, height, camera, platform)
+
+
+@cache
+def choose_platform() -> tuple[str | None, str]:
+    """The OpenGL platform that works on this machine, and why none does.
+
+    Each is tried in a process of its own: a broken driver may take its process with it, and two
+    platforms do not share one. ``MUJOCO_GL`` names the only one to try, or forbids all (``disable``).
+    """
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    if asked in ("disable", "disabled", "off", "false", "0"):
+        return None, f"MUJOCO_GL={asked}"
+    names = (asked,) if asked in PLATFORMS else PLATFORMS
+    reasons = []
+    for name in names:
+        problem = _try_platform(name)
+        if problem is None:
+            return name, ""
+        reasons.append(f"{name}: {problem}")
+    return None, "; ".join(reasons)
+
+
+def _try_platform(name: str) -> str | None:
+    """None where a picture can be made, else what went wrong."""
+    code = (
+        f"import mujoco, mujoco.{name} as p\nc = p.GLContext(16, 16)\nc.make_current()\n"
+        "m = mujoco.MjModel.from_xml_string('<mujoco/>')\nmujoco.MjrContext(m, 100)"
+    )
+    environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    try:
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    except subprocess.TimeoutExpired:
+        return "no answer within 60 s"
+    if done.returncode == 0:
+        return None
+    lines = [line for line in done.stderr.strip().splitlines() if not line.startswith((" ", "Exception ignored"))]
+    return lines[-1] if lines else f"exit status {done.returncode}"
+
+
+def colour_of(choice: int) -> tuple[float, float, float]:
+    """Of a sub-policy's direction, or of a flat policy."""
+    return rgb(FLAT_COLOUR if choice < 0 else DIRECTION_COLOURS[choice])
+
+
+class _Pose:
+    """The ant of a film: a model that is posed, never stepped."""
+
+    def __init__(self, footage: Footage, spec: mujoco.MjSpec):
+        self.footage = footage
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.parts = [self.model.geom(number).name.split("_")[0] for number in range(self.model.ngeom)]
+
+    def at(self, step: int) -> tuple[float, float, float]:
+        """Pose the ant after ``step`` control steps and paint its parts; returns the colour of who moved it there."""
+        self.data.qpos[:] = self.footage.qpos[step]
+        mujoco.mj_forward(self.model, self.data)
+        tint = colour_of(int(self.footage.choice[max(step - 1, 0)]))
+        for number, part in enumerate(self.parts):
+            if part in ("torso", "stub", "thigh", "shin"):
+                self.model.geom_rgba[number, :3] = self.shade(part, tint)
+        return tint
+
+    @staticmethod
+    def shade(part: str, tint: tuple[float, float, float]) -> tuple[float, ...]:
+        mixed = {"shin": 1.0, "thigh": 0.25}.get(part, 0.0)
+        return tuple(a + (b - a) * mixed for a, b in zip(tint, _SHIN, strict=True))
+
+
+class GLPainter:
+    """MuJoCo's own renderer."""
+
+    def __init__(self, footage: Footage, width: int, height: int, camera: CameraName, platform: str):
+        self._context = importlib.import_module(f"mujoco.{platform}").GLContext(width, height)
+        self._context.make_current()
+        self._pose = _Pose(footage, _furnished(footage, width, height))
+        self._scene = mujoco.MjvScene(self._pose.model, maxgeom=2000 + footage.num_steps // _CURVE_STEPS)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = True
+        self._renderer = mujoco.MjrContext(self._pose.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._renderer)
+        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._pixels = np.empty((height, width, 3), np.uint8)
+        self._camera_name, self._footage = camera, footage
+        self._way = smooth_way(footage)
+
+    def paint(self, step: int) -> np.ndarray:
+        self._context.make_current()
+        self._pose.at(step)
+        options, perturbation = mujoco.MjvOption(), mujoco.MjvPerturb()
+        camera = _gl_camera(self._camera_name, self._footage, self._way[step], self._rectangle)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(
+            self._pose.model, self._pose.data, options, perturbation, camera, everything, self._scene
+        )
+        _add_path(self._scene, self._footage, step)
+        _add_goal(self._scene, self._footage)
+        mujoco.mjr_render(self._rectangle, self._scene, self._renderer)
+        mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._renderer)
+        return np.flipud(self._pixels).copy()
+
+    def close(self) -> None:
+        self._context.make_current()
+        self._renderer.free()
+        self._context.free()
+
+
+def _furnished(footage: Footage, width: int, height: int) -> mujoco.MjSpec:
+    """The model of the film's arena, with light for a picture."""
+    spec = build_spec(footage.task.robot, footage.task.arena)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    spec.visual.quality.offsamples, spec.visual.quality.shadowsize = 4, 2048
+    spec.visual.headlight.ambient = [0.38, 0.38, 0.40]
+    spec.visual.headlight.diffuse = [0.18, 0.18, 0.18]
+    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+    x, y, half_x, half_y = extent(footage)
+    # MuJoCo's shadows of a directional light are sound well within this distance only
+    spec.stat.center, spec.stat.extent = [x, y, 0.0], max(30.0, 4 * half_x, 4 * half_y)
+    spec.visual.map.znear, spec.visual.map.zfar, spec.visual.map.shadowclip = 0.03, 8.0, 1.0
+    for light in spec.lights:
+        light.pos, light.dir = [x, y, 20.0], [-0.25, 0.3, -0.92]
+        light.diffuse, light.ambient, light.specular = [0.55, 0.54, 0.52], [0.0] * 3, [0.12] * 3
+    for texture in spec.textures:
+        if texture.name == "sky":
+            texture.rgb1, texture.rgb2 = list(_BACKGROUND), list(_BACKGROUND)
+    for geom in spec.geoms:
+        if geom.name.startswith("wall"):
+            geom.rgba, geom.pos[2], geom.size[2] = [*_WALL, 1.0], _WALL_HEIGHT / 2, _WALL_HEIGHT / 2
+    return spec
+
+
+def smooth_way(footage: Footage, seconds: float = 1.0) -> np.ndarray:
+    """Where a following camera looks after each control step, [T + 1, 2] in m: the torso's mean over a while."""
+    half = max(1, round(seconds / footage.control_dt / 2))
+    padded = np.pad(footage.qpos[:, :2].astype(np.float64), ((half, half), (0, 0)), mode="edge")
+    sums = np.cumsum(np.concatenate([np.zeros((1, 2)), padded]), axis=0)
+    return (sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1)
+
+
+def _gl_camera(name: CameraName, footage: Footage, at: np.ndarray, rectangle: mujoco.MjrRect) -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE.value
+    camera.azimuth = 90.0
+    if name == "follow":
+        camera.lookat[:] = (*at, 0.3)
+        camera.distance, camera.elevation = _FOLLOW_DISTANCE, -42.0
+        return camera
+    x, y, half_x, half_y = extent(footage, margin=_MARGIN)
+    camera.elevation = -89.9 if name == "above" else -58.0
+    room = 0.0 if name == "above" else 0.13 * half_y  # below, for the caption
+    camera.lookat[:] = (x, y - room, 0.0)
+    tall = half_y if name == "above" else 0.9 * half_y + 0.6 + room
+    half_view = np.tan(np.radians(45.0) / 2)  # MuJoCo's vertical field of view is 45 degrees
+    camera.distance = max(tall, half_x * rectangle.height / rectangle.width) / half_view
+    return camera
+
+
+def _add_path(scene: mujoco.MjvScene, footage: Footage, step: int) -> None:
+    knots = [*range(0, step, _CURVE_STEPS), step]
+    for a, b in pairwise(knots):
+        along = (footage.qpos[b, :2] - footage.qpos[a, :2]).astype(np.float64)
+        length = float(np.hypot(*along))
+        if length < 1e-6:
+            continue
+        middle = footage.qpos[[a, b], :2].mean(axis=0)
+        (x, y), size = along / length, (length / 2 + 0.6 * _PATH_HALF_WIDTH, _PATH_HALF_WIDTH, 0.003)
+        tint = tuple(0.85 * channel for channel in colour_of(int(footage.choice[a])))
+        geom = _new_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, tint, size, (*middle, 0.004))
+        geom.mat = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _add_goal(scene: mujoco.MjvScene, footage: Footage) -> None:
+    if not footage.has_goal:
+        return
+    (x, y), colour = footage.goal.astype(np.float64), rgb(GOAL_COLOUR)
+    for kind, size, height in (
+        (mujoco.mjtGeom.mjGEOM_CYLINDER, (footage.task.goal_radius, 0.01, 0.0), 0.01),
+        (mujoco.mjtGeom.mjGEOM_CAPSULE, (0.04, 1.2, 0.0), 1.2),
+        (mujoco.mjtGeom.mjGEOM_SPHERE, (0.18, 0.0, 0.0), 2.5),
+    ):
+        _new_geom(scene, kind, colour, size, (x, y, height))
+
+
+def _new_geom(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    colour: tuple[float, ...],
+    size: tuple[Any, ...] = (0.0, 0.0, 0.0),
+    position: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> Any:
+    geom = scene.geoms[scene.ngeom]
+    scene.ngeom += 1
+    shape = (np.array(size, np.float64), np.array(position, np.float64), np.eye(3).ravel())
+    mujoco.mjv_initGeom(geom, kind.value, *shape, np.array([*colour, 1.0], np.float32))
+    return geom
+
+
+class SketchPainter:
+    """Drawn from above with a pen, where there is no OpenGL: walls, path, goal, and the ant's limbs by height."""
+
+    _FINER = 2  # drawn so much larger, then reduced: soft edges
+
+    def __init__(self, footage: Footage, width: int, height: int, camera: CameraName):
+        self._footage, self._size = footage, (width, height)
+        self._pose = _Pose(footage, build_spec(footage.task.robot, footage.task.arena))
+        self._follows = camera == "follow"
+        x, y, half_x, half_y = extent(footage, margin=_MARGIN)
+        fit = min(width / half_x, height / half_y) / 2
+        self._scale = self._FINER * (height / _FOLLOW_DISTANCE if self._follows else fit)  # pixels per m
+        self._way = smooth_way(footage) if self._follows else np.full((footage.num_steps + 1, 2), (x, y))
+
+    def paint(self, step: int) -> np.ndarray:
+        image = Image.new("RGB", (self._FINER * self._size[0], self._FINER * self._size[1]), _byte(_BACKGROUND))
+        pen, at = ImageDraw.Draw(image), self._way[step]
+        tint = self._pose.at(step)
+        self._draw_floor(pen, at)
+        arena, footage = self._footage.task.arena, self._footage
+        for wall in arena.walls:
+            corners = [(wall.x - wall.half_x, wall.y + wall.half_y), (wall.x + wall.half_x, wall.y - wall.half_y)]
+            pen.rectangle([self._pixel(corner, at) for corner in corners], fill=_byte(_WALL))
+        if footage.has_goal:
+            self._disc(pen, footage.goal, footage.task.goal_radius or 0.5, at, _byte(rgb(GOAL_COLOUR)))
+        for i in range(0, step, 2):
+            ends = (footage.qpos[i, :2], footage.qpos[min(i + 2, step), :2])
+            self._limb(pen, *ends, _PATH_HALF_WIDTH, at, colour_of(int(footage.choice[i])))
+        self._draw_ant(pen, at, tint)
+        return np.asarray(image.resize(self._size, Image.Resampling.BOX))
+
+    def _draw_floor(self, pen: ImageDraw.ImageDraw, at: np.ndarray) -> None:
+        reach = np.array(self._size) * self._FINER / 2 / self._scale
+        for axis in (0, 1):
+            for line in range(int(np.floor(at[axis] - reach[axis])), int(np.ceil(at[axis] + reach[axis])) + 1):
+                low, high = at - reach, at + reach
+                low[axis] = high[axis] = line
+                shade = 0.80 if line % 4 == 0 else 0.89
+                pen.line([self._pixel(low, at), self._pixel(high, at)], fill=_byte((shade,) * 3), width=self._FINER)
+
+    def _draw_ant(self, pen: ImageDraw.ImageDraw, at: np.ndarray, tint: tuple[float, float, float]) -> None:
+        model, data = self._pose.model, self._pose.data
+        ant = [number for number in range(model.ngeom) if model.geom_bodyid[number] > 0]
+        for number in sorted(ant, key=lambda geom: data.geom_xpos[geom, 2]):
+            sphere = model.geom_type[number] == mujoco.mjtGeom.mjGEOM_SPHERE
+            along = 0.0 if sphere else data.geom_xmat[number].reshape(3, 3)[:2, 2] * model.geom_size[number, 1]
+            centre, radius = data.geom_xpos[number, :2], float(model.geom_size[number, 0])
+            colour = self._pose.shade(self._pose.parts[number], tint)
+            dark = tuple(0.65 * channel for channel in colour)
+            for size, shade in ((radius, dark), (0.8 * radius, colour)):
+                self._limb(pen, centre - along, centre + along, size, at, shade)
+
+    def _limb(self, pen: Any, a: Any, b: Any, radius: float, at: np.ndarray, colour: tuple[float, ...]) -> None:
+        fill = _byte(colour)
+        pen.line([self._pixel(a, at), self._pixel(b, at)], fill=fill, width=max(1, round(2 * radius * self._scale)))
+        self._disc(pen, a, radius, at, fill)
+        self._disc(pen, b, radius, at, fill)
+
+    def _disc(self, pen: Any, centre: Any, radius: float, at: np.ndarray, fill: tuple[int, ...]) -> None:
+        (x, y), r = self._pixel(centre, at), radius * self._scale
+        pen.ellipse([x - r, y - r, x + r, y + r], fill=fill)
+
+    def _pixel(self, point: Any, at: np.ndarray) -> tuple[float, float]:
+        width, height = (self._FINER * side for side in self._size)
+        x, y = (np.asarray(point, np.float64) - at) * self._scale
+        return width / 2 + float(x), height / 2 - float(y)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def _byte(colour: tuple[float, ...]) -> tuple[int, ...]:
+    return tuple(round(255 * min(max(channel, 0.0), 1.0)) for channel in colour)

@@ -1,0 +1,983 @@
+// Shows recorded episodes: forward kinematics of the ant, a small WebGL 2 renderer, and the controls. It fetches nothing.
+"use strict";
+
+// ---------------------------------------------------------------- decoding
+
+const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+
+// One episode's numbers; frames are [T + 1, 15], each column quantised to 16 bits between its own bounds.
+function decode(episode) {
+  const packed = new Uint16Array(bytes(episode.frames).buffer);
+  const width = episode.low.length;
+  const frames = new Float32Array(packed.length);
+  for (let i = 0; i < packed.length; i++) frames[i] = episode.low[i % width] + episode.step[i % width] * packed[i];
+  return {
+    frames,
+    width,
+    steps: packed.length / width - 1,
+    choice: new Int8Array(bytes(episode.choice).buffer),
+    total: new Float32Array(bytes(episode.total).buffer),
+    distance: new Float32Array(bytes(episode.distance).buffer),
+    flags: bytes(episode.flags), // 1 fallen, 2 upside down
+    odds: bytes(episode.odds), // [decisions, 4], 255 is certain; empty where nobody chooses
+    value: new Float32Array(bytes(episode.value).buffer), // [decisions], empty where the critic is not at hand
+  };
+}
+
+// The pose at a time in control steps: linear, and the quaternion along the shorter arc.
+function poseAt(data, time) {
+  const at = Math.max(0, Math.min(time, data.steps));
+  const i = Math.min(Math.floor(at), Math.max(data.steps - 1, 0));
+  const u = at - i;
+  const a = i * data.width;
+  const b = Math.min(i + 1, data.steps) * data.width;
+  const f = data.frames;
+  let dot = 0;
+  for (let k = 3; k < 7; k++) dot += f[a + k] * f[b + k];
+  const q = [];
+  for (let k = 0; k < data.width; k++) {
+    const sign = k >= 3 && k < 7 && dot < 0 ? -1 : 1;
+    q.push(f[a + k] * (1 - u) + sign * f[b + k] * u);
+  }
+  const norm = Math.hypot(q[3], q[4], q[5], q[6]) || 1;
+  for (let k = 3; k < 7; k++) q[k] /= norm;
+  return q;
+}
+
+// ---------------------------------------------------------------- kinematics (3 x 3 matrices row by row, z up)
+
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const dot3 = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const plus = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+const minus = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+const times = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
+const unit = (a) => times(a, 1 / (Math.hypot(...a) || 1));
+
+function fromQuaternion([w, x, y, z]) {
+  return [
+    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+  ];
+}
+
+function aboutAxis(axis, angle) {
+  const [x, y, z] = times(unit(axis), Math.sin(angle / 2));
+  return fromQuaternion([Math.cos(angle / 2), x, y, z]);
+}
+
+function product(a, b) {
+  const c = new Array(9);
+  for (let i = 0; i < 3; i++) {
+    for (let j = 0; j < 3; j++) c[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
+  }
+  return c;
+}
+
+const turn = (m, v) => [dot3(m.slice(0, 3), v), dot3(m.slice(3, 6), v), dot3(m.slice(6, 9), v)];
+
+// Where every geom is: [{ position, rotation }] in the world, from the skeleton that comes with the footage.
+function geomPoses(skeleton, qpos) {
+  const bodies = [];
+  for (const body of skeleton.bodies) {
+    if (body.free) {
+      bodies.push({ position: qpos.slice(0, 3), rotation: fromQuaternion(qpos.slice(3, 7)) });
+      continue;
+    }
+    const parent = bodies[body.parent];
+    const position = plus(parent.position, turn(parent.rotation, body.position));
+    let rotation = product(parent.rotation, fromQuaternion(body.rotation));
+    if (body.axis) rotation = product(rotation, aboutAxis(body.axis, qpos[body.index]));
+    bodies.push({ position, rotation });
+  }
+  return skeleton.geoms.map((geom) => {
+    const body = bodies[geom.body];
+    return {
+      position: plus(body.position, turn(body.rotation, geom.position)),
+      rotation: product(body.rotation, fromQuaternion(geom.rotation)),
+    };
+  });
+}
+
+// ---------------------------------------------------------------- 4 x 4 matrices (column by column)
+
+function matrix(rotation, position) {
+  const r = rotation;
+  return [r[0], r[3], r[6], 0, r[1], r[4], r[7], 0, r[2], r[5], r[8], 0, ...position, 1];
+}
+
+function multiply(a, b) {
+  const c = new Array(16).fill(0);
+  for (let j = 0; j < 4; j++) {
+    for (let i = 0; i < 4; i++) for (let k = 0; k < 4; k++) c[4 * j + i] += a[4 * k + i] * b[4 * j + k];
+  }
+  return c;
+}
+
+function lookAt(eye, target, up) {
+  const back = unit(minus(eye, target));
+  const right = unit(cross(up, back));
+  const top = cross(back, right);
+  return [
+    right[0], top[0], back[0], 0, right[1], top[1], back[1], 0, right[2], top[2], back[2], 0,
+    -dot3(right, eye), -dot3(top, eye), -dot3(back, eye), 1,
+  ];
+}
+
+function perspective(fov, aspect, near, far) {
+  const f = 1 / Math.tan(fov / 2);
+  return [f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / (near - far), -1, 0, 0, 2 * far * near / (near - far), 0];
+}
+
+const orthographic = (half, near, far) =>
+  [1 / half, 0, 0, 0, 0, 1 / half, 0, 0, 0, 0, 2 / (near - far), 0, 0, 0, (far + near) / (near - far), 1];
+
+// ---------------------------------------------------------------- WebGL
+
+const MAX_WALLS = 48; // as many get a soft edge on the floor
+const SHADOW_HALF = 13; // m around the ant
+
+const COMMON = `#version 300 es
+precision highp float;
+precision highp sampler2DShadow;
+`;
+const VERTEX = COMMON + `
+layout(location = 0) in vec3 aNormal;
+layout(location = 1) in vec3 aOffset; // of capsules and boxes: which end, which corner
+layout(location = 2) in vec3 aColour;
+uniform mat4 uModel, uView;
+uniform vec3 uSize;
+uniform float uRadius;
+uniform int uFlat; // 1: aOffset is the place itself
+out vec3 vPlace, vNormal, vColour;
+void main() {
+  vec3 local = uFlat == 1 ? aOffset : aNormal * uRadius + aOffset * uSize;
+  vec4 place = uModel * vec4(local, 1.0);
+  vPlace = place.xyz;
+  vNormal = mat3(uModel) * aNormal;
+  vColour = aColour;
+  gl_Position = uView * place;
+}`;
+const DEPTH_FRAGMENT = COMMON + "void main() {}";
+const fragment = (shadowSize, taps) => COMMON + `
+in vec3 vPlace, vNormal, vColour;
+uniform vec3 uColour, uEye, uLight, uBack, uFocus, uLine;
+uniform mat4 uShadow;
+uniform sampler2DShadow uDepth;
+uniform int uKind; // 0 the ant and the flag, 1 a wall, 2 the floor, 3 a path
+uniform vec4 uGoal; // x, y, radius, 1 where there is one
+uniform vec4 uStart;
+uniform vec3 uGoalColour;
+uniform vec4 uWalls[${MAX_WALLS}];
+uniform int uNumWalls;
+uniform float uDark, uFog;
+out vec4 colour;
+
+float lit(vec3 normal) {
+  vec4 p = uShadow * vec4(vPlace + normal * 0.02, 1.0);
+  vec3 q = p.xyz * 0.5 + 0.5;
+  if (any(lessThan(q, vec3(0.0))) || any(greaterThan(q, vec3(1.0)))) return 1.0;
+  float sum = 0.0;
+  for (int i = -${taps}; i <= ${taps}; i++)
+    for (int j = -${taps}; j <= ${taps}; j++)
+      sum += texture(uDepth, vec3(q.xy + vec2(i, j) * 1.1 / ${shadowSize}.0, q.z - 0.0012));
+  vec2 edge = smoothstep(vec2(0.5), vec2(0.44), abs(q.xy - 0.5));
+  return mix(1.0, sum / ${(2 * taps + 1) ** 2}.0, edge.x * edge.y);
+}
+
+float lines(vec2 p, float spacing, float width) {
+  vec2 d = fwidth(p), away = abs(fract(p / spacing + 0.5) - 0.5) * spacing;
+  vec2 on = 1.0 - smoothstep(vec2(width) , vec2(width) + d * 1.2, away);
+  on *= smoothstep(vec2(spacing * 0.6), vec2(spacing * 0.15), d);
+  return max(on.x, on.y);
+}
+
+float nearWalls(vec2 p) {
+  float nearest = 9.0;
+  for (int i = 0; i < ${MAX_WALLS}; i++) {
+    if (i >= uNumWalls) break;
+    vec2 d = abs(p - uWalls[i].xy) - uWalls[i].zw;
+    if (max(d.x, d.y) < 0.0) return 9.0; // below a wall, seen through its glass
+    nearest = min(nearest, length(max(d, 0.0)));
+  }
+  return nearest;
+}
+
+vec3 floorColour() {
+  vec3 base = mix(uBack, uLine, 0.10);
+  base = mix(base, uLine, 0.28 * lines(vPlace.xy, 1.0, 0.004));
+  base = mix(base, uLine, 0.5 * lines(vPlace.xy, 4.0, 0.012));
+  float d = fwidth(vPlace.x) + fwidth(vPlace.y);
+  float s = abs(distance(vPlace.xy, uStart.xy) - 0.45);
+  base = mix(base, mix(uLine, vec3(uDark), 0.55), (1.0 - smoothstep(0.03, 0.03 + d, s)) * uStart.w);
+  float g = distance(vPlace.xy, uGoal.xy);
+  float disc = 1.0 - smoothstep(uGoal.z, uGoal.z + d, g);
+  float ring = 1.0 - smoothstep(0.05, 0.05 + d, abs(g - uGoal.z));
+  base = mix(base, uGoalColour, uGoal.w * max(0.35 * disc, ring));
+  return base * mix(0.62, 1.0, smoothstep(0.0, 0.7, nearWalls(vPlace.xy)));
+}
+
+// Walls between the eye and the ant are glass.
+float glass() {
+  vec3 ray = uFocus - uEye;
+  float t = dot(vPlace - uEye, ray) / dot(ray, ray);
+  float keep = smoothstep(0.9, 2.6, distance(vPlace, uEye + clamp(t, 0.0, 1.0) * ray));
+  return mix(0.14, 1.0, max(keep, smoothstep(0.97, 1.0, t)));
+}
+
+void main() {
+  vec3 normal = normalize(vNormal);
+  vec3 base = uKind == 2 ? floorColour() : uKind == 3 ? vColour : uColour;
+  float opacity = 1.0;
+  if (uKind == 1) {
+    opacity = glass();
+    base *= mix(0.8, 1.0, smoothstep(0.0, 1.2, vPlace.z));
+  }
+  float sun = max(dot(normal, uLight), 0.0);
+  if (sun > 0.0) sun *= lit(normal);
+  float sky = 0.5 + 0.5 * normal.z;
+  vec3 light = vec3(1.0, 0.97, 0.92) * sun * 0.62 + mix(vec3(0.50, 0.48, 0.46), vec3(0.50, 0.53, 0.58), sky) * 0.9;
+  vec3 c = base * (uKind >= 2 ? mix(vec3(1.0), light, uKind == 2 ? 0.85 : 0.45) : light);
+  if (uKind == 0) {
+    vec3 half_ = normalize(uLight + normalize(uEye - vPlace));
+    c += 0.16 * pow(max(dot(normal, half_), 0.0), 40.0) * step(0.01, sun);
+    c += 0.10 * pow(1.0 - max(dot(normal, normalize(uEye - vPlace)), 0.0), 3.0);
+  }
+  float fog = smoothstep(uFog, uFog * 2.2, distance(vPlace, uFocus));
+  c = mix(c, uBack, uKind == 0 ? 0.0 : fog);
+  colour = vec4(c, opacity);
+}`;
+
+// A sphere cut in two, its halves to be moved apart along z: spheres and capsules of any size.
+function capsuleMesh() {
+  const normals = [], offsets = [], index = [];
+  const rings = 9, sectors = 28;
+  for (const end of [1, -1]) {
+    for (let i = 0; i <= rings; i++) {
+      const polar = ((end > 0 ? i : rings + i) * Math.PI) / 2 / rings;
+      for (let j = 0; j <= sectors; j++) {
+        const around = (2 * Math.PI * j) / sectors;
+        normals.push(Math.sin(polar) * Math.cos(around), Math.sin(polar) * Math.sin(around), Math.cos(polar));
+        offsets.push(0, 0, end);
+      }
+    }
+  }
+  for (let i = 0; i < 2 * rings + 1; i++) {
+    for (let j = 0; j < sectors; j++) {
+      const a = i * (sectors + 1) + j, b = a + sectors + 1;
+      index.push(a, b, a + 1, a + 1, b, b + 1);
+    }
+  }
+  return { normals, offsets, index };
+}
+
+function boxMesh() {
+  const normals = [], offsets = [], index = [];
+  for (let axis = 0; axis < 3; axis++) {
+    for (const side of [1, -1]) {
+      const first = normals.length / 3;
+      for (const [u, v] of [[-1, -1], [1, -1], [1, 1], [-1, 1]]) {
+        const n = [0, 0, 0], p = [0, 0, 0];
+        n[axis] = p[axis] = side;
+        p[(axis + 1) % 3] = u * side;
+        p[(axis + 2) % 3] = v;
+        normals.push(...n);
+        offsets.push(...p);
+      }
+      index.push(first, first + 1, first + 2, first, first + 2, first + 3);
+    }
+  }
+  return { normals, offsets, index };
+}
+
+// The path as a ribbon on the floor: two triangles per control step, in the colour of the sub-policy.
+function ribbonMesh(data, colours, half) {
+  const place = (i) => [data.frames[i * data.width], data.frames[i * data.width + 1]];
+  const normals = [], offsets = [], tints = [], index = [];
+  const sides = [];
+  let heading = [1, 0];
+  for (let i = 0; i <= data.steps; i++) {
+    const a = place(Math.max(i - 3, 0)), b = place(Math.min(i + 3, data.steps));
+    const length = Math.hypot(b[0] - a[0], b[1] - a[1]);
+    if (length > 1e-3) heading = [(b[0] - a[0]) / length, (b[1] - a[1]) / length];
+    const p = place(i);
+    sides.push([[p[0] - heading[1] * half, p[1] + heading[0] * half], [p[0] + heading[1] * half, p[1] - heading[0] * half]]);
+  }
+  for (let i = 0; i < data.steps; i++) {
+    const tint = colours(data.choice[i]);
+    const first = offsets.length / 3;
+    for (const side of [...sides[i], ...sides[i + 1]]) {
+      normals.push(0, 0, 1);
+      offsets.push(side[0], side[1], 0.012);
+      tints.push(...tint);
+    }
+    index.push(first, first + 1, first + 2, first + 1, first + 3, first + 2);
+  }
+  return { normals, offsets, tints, index };
+}
+
+// Whether OpenGL runs in software here: then less is drawn, and as smoothly.
+function isLean() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const info = gl && gl.getExtension("WEBGL_debug_renderer_info");
+  return /swiftshader|llvmpipe|softpipe|software/i.test(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "");
+}
+
+class Renderer {
+  constructor(gl, lean) {
+    this.gl = gl;
+    this.shadowSize = lean ? 1024 : 2048;
+    this.main = this.program(VERTEX, fragment(this.shadowSize, lean ? 0 : 1));
+    this.depth = this.program(VERTEX, DEPTH_FRAGMENT);
+    this.capsule = this.mesh(capsuleMesh());
+    this.box = this.mesh(boxMesh());
+    this.shadowMap = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, this.shadowMap);
+    gl.texImage2D(
+      gl.TEXTURE_2D, 0, gl.DEPTH_COMPONENT24, this.shadowSize, this.shadowSize, 0, gl.DEPTH_COMPONENT, gl.UNSIGNED_INT, null);
+    for (const [name, value] of [
+      [gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
+      [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
+      [gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE], [gl.TEXTURE_COMPARE_FUNC, gl.LEQUAL],
+    ]) gl.texParameteri(gl.TEXTURE_2D, name, value);
+    this.target = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, this.shadowMap, 0);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.enable(gl.DEPTH_TEST);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+  }
+
+  // Before the panels: the ground between them.
+  wipe(colour, width, height) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.scissor(0, 0, width, height);
+    gl.clearColor(...colour, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+  }
+
+  program(vertex, fragment) {
+    const gl = this.gl, handle = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+      gl.attachShader(handle, shader);
+    }
+    gl.linkProgram(handle);
+    if (!gl.getProgramParameter(handle, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(handle));
+    const places = {};
+    for (let i = 0; i < gl.getProgramParameter(handle, gl.ACTIVE_UNIFORMS); i++) {
+      const name = gl.getActiveUniform(handle, i).name;
+      places[name.replace("[0]", "")] = gl.getUniformLocation(handle, name);
+    }
+    return { handle, places };
+  }
+
+  mesh({ normals, offsets, tints, index }) {
+    const gl = this.gl, array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    [normals, offsets, tints].forEach((numbers, i) => {
+      if (!numbers) return;
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(numbers), gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(i);
+      gl.vertexAttribPointer(i, 3, gl.FLOAT, false, 0, 0);
+    });
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(index), gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    return { array, count: index.length };
+  }
+
+  set(values) {
+    const gl = this.gl, places = this.active.places;
+    for (const [name, value] of Object.entries(values)) {
+      const place = places[name];
+      if (place === undefined) continue;
+      if (name === "uKind" || name === "uFlat" || name === "uNumWalls" || name === "uDepth") gl.uniform1i(place, value);
+      else if (typeof value === "number") gl.uniform1f(place, value);
+      else if (name === "uWalls") gl.uniform4fv(place, value);
+      else if (value.length === 16) gl.uniformMatrix4fv(place, false, value);
+      else if (value.length === 4) gl.uniform4fv(place, value);
+      else gl.uniform3fv(place, value);
+    }
+  }
+
+  draw(thing) {
+    const gl = this.gl;
+    this.set({
+      uModel: thing.model, uSize: thing.size, uRadius: thing.radius, uFlat: thing.flat ? 1 : 0,
+      uKind: thing.kind, uColour: thing.colour,
+    });
+    gl.bindVertexArray(thing.mesh.array);
+    gl.drawElements(gl.TRIANGLES, thing.count ?? thing.mesh.count, gl.UNSIGNED_INT, 0);
+  }
+
+  // One scene into one rectangle [x, y, width, height] of the canvas, in pixels from the lower left.
+  render(scene, rectangle) {
+    const gl = this.gl, light = unit([0.42, -0.5, 0.95]);
+    const sun = lookAt(plus(scene.focus, times(light, 30)), scene.focus, [0, 1, 0]);
+    const shadow = multiply(orthographic(SHADOW_HALF, 5, 60), sun);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.viewport(0, 0, this.shadowSize, this.shadowSize);
+    gl.scissor(0, 0, this.shadowSize, this.shadowSize);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    this.use(this.depth);
+    this.set({ uView: shadow });
+    scene.things.filter((thing) => thing.kind < 2).forEach((thing) => this.draw(thing));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(...rectangle);
+    gl.scissor(...rectangle);
+    gl.clearColor(...scene.uniforms.uBack, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    this.use(this.main);
+    gl.bindTexture(gl.TEXTURE_2D, this.shadowMap);
+    this.set({ ...scene.uniforms, uView: scene.view, uShadow: shadow, uLight: light, uDepth: 0 });
+    const away = (thing) => -Math.hypot(...minus(thing.model.slice(12, 15), scene.eye));
+    const walls = scene.things.filter((thing) => thing.kind === 1).sort((a, b) => away(a) - away(b));
+    scene.things.filter((thing) => thing.kind !== 1).forEach((thing) => this.draw(thing));
+    gl.enable(gl.BLEND);
+    gl.enable(gl.CULL_FACE);
+    walls.forEach((thing) => this.draw(thing));
+    gl.disable(gl.BLEND);
+    gl.disable(gl.CULL_FACE);
+  }
+
+  use(program) {
+    this.active = program;
+    this.gl.useProgram(program.handle);
+  }
+}
+
+// ---------------------------------------------------------------- what is on the page
+
+const THEMES = {
+  light: { back: "#f4f3ef", line: "#8d8a80", wall: "#b9bbc2", shin: "#4d525c", dark: 0 },
+  dark: { back: "#17191d", line: "#7d828c", wall: "#4b505a", shin: "#a9aeb8", dark: 1 },
+};
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
+const FOV = 0.72; // rad, vertical
+const GOAL = "#D55E00";
+const ARROWS = ["→", "↑", "←", "↓"];
+const IDENTITY = [1, 0, 0, 0, 1, 0, 0, 0, 1];
+
+const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255);
+const mix = (a, b, t) => a.map((v, i) => v + (b[i] - v) * t);
+const element = (tag, className, parent, text) => {
+  const made = document.createElement(tag);
+  if (className) made.className = className;
+  if (text !== undefined) made.textContent = text;
+  if (parent) parent.append(made);
+  return made;
+};
+let fineness = 1; // less where pictures come slowly
+const pixels = () => Math.min(window.devicePixelRatio || 1, 2) * fineness;
+
+class Viewer {
+  constructor(footage) {
+    this.footage = footage;
+    this.colours = footage.colours.map(rgb);
+    this.flatColour = rgb(footage.flat_colour);
+    this.episodes = footage.episodes.map((episode) => ({ ...episode, data: decode(episode) }));
+    this.steps = Math.max(...this.episodes.map((episode) => episode.data.steps));
+    this.time = 0;
+    this.playing = false;
+    this.speed = 1;
+    this.theme = window.matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+    this.view = { azimuth: -Math.PI / 2, elevation: 0.98, distance: 10.5, shift: [0, 0, 0] };
+    this.canvas = document.getElementById("view");
+    const lean = isLean(), gl = this.canvas.getContext("webgl2", { antialias: !lean, alpha: false });
+    this.renderer = gl ? new Renderer(gl, lean) : null;
+    this.buildLegend();
+    this.episodes.forEach((episode) => this.buildPanel(episode));
+    this.buildTracks();
+    this.buildControls();
+    this.setTheme(this.theme);
+    this.setCamera("follow");
+    new ResizeObserver(() => this.layout()).observe(document.getElementById("stage"));
+    this.layout();
+  }
+
+  colourOf(choice) {
+    return choice < 0 ? this.flatColour : this.colours[choice];
+  }
+
+  buildLegend() {
+    const legend = document.getElementById("legend");
+    const used = new Set(this.episodes.flatMap((episode) => Array.from(episode.data.choice)));
+    this.footage.directions.forEach((name, i) => {
+      if (!used.has(i)) return;
+      const entry = element("span", "", legend);
+      element("i", "", entry).style.background = this.footage.colours[i];
+      entry.append(`${ARROWS[i]} ${name}`);
+    });
+    if (used.has(-1)) {
+      const entry = element("span", "", legend);
+      element("i", "", entry).style.background = this.footage.flat_colour;
+      entry.append("flat policy");
+    }
+  }
+
+  buildPanel(episode) {
+    const panel = element("section", "panel", document.getElementById("stage"));
+    const card = element("div", "card", panel);
+    element("h2", "", card, episode.row);
+    element("small", "", card, episode.label);
+    const hud = { panel, chip: element("span", "chip", card) };
+    const list = element("dl", "", card);
+    const names = [["return", "return"], ["distance", episode.goal ? "to the goal" : "walked"]];
+    if (episode.data.value.length) names.push(["value", "value"]);
+    for (const [key, name] of names) {
+      element("dt", "", list, name);
+      hud[key] = element("dd", "", list, "");
+    }
+    hud.spark = element("canvas", "spark", card);
+    if (episode.data.odds.length) {
+      const odds = element("div", "odds", card);
+      hud.odds = ARROWS.map((arrow, i) => {
+        const column = element("span", "", odds);
+        const bar = element("b", "", element("i", "", column));
+        bar.style.background = this.footage.colours[i];
+        column.append(arrow);
+        return bar;
+      });
+    }
+    hud.badge = element("div", "badge", panel);
+    episode.hud = hud;
+    if (this.renderer) episode.ribbon = this.renderer.mesh(ribbonMesh(episode.data, (c) => this.colourOf(c), 0.055));
+  }
+
+  buildTracks() {
+    const tracks = document.getElementById("tracks");
+    const height = Math.max(5, Math.min(14, 48 / this.episodes.length));
+    for (const episode of this.episodes) {
+      const track = element("canvas", "track", tracks);
+      track.style.height = `${height}px`;
+      track.title = `${episode.row}, ${episode.label}`;
+      episode.track = track;
+    }
+    this.head = element("div", "", tracks);
+    this.head.id = "head";
+    tracks.setAttribute("aria-valuemax", this.steps);
+    const scrub = (event) => {
+      const box = tracks.getBoundingClientRect();
+      this.seek(((event.clientX - box.left) / box.width) * this.steps);
+    };
+    tracks.addEventListener("pointerdown", (event) => {
+      tracks.setPointerCapture(event.pointerId);
+      this.resume = this.playing;
+      this.setPlaying(false);
+      scrub(event);
+    });
+    tracks.addEventListener("pointermove", (event) => tracks.hasPointerCapture(event.pointerId) && scrub(event));
+    tracks.addEventListener("pointerup", () => this.resume && this.setPlaying(true));
+  }
+
+  drawTracks() {
+    for (const episode of this.episodes) {
+      const { track, data } = episode;
+      track.width = track.clientWidth * pixels();
+      track.height = track.clientHeight * pixels();
+      const pen = track.getContext("2d"), scale = track.width / this.steps;
+      for (let i = 0; i < data.steps; i++) {
+        let end = i + 1;
+        while (end < data.steps && data.choice[end] === data.choice[i] && data.flags[end] === data.flags[i]) end++;
+        const choice = data.choice[i];
+        pen.fillStyle = choice < 0 ? this.footage.flat_colour : this.footage.colours[choice];
+        pen.fillRect(i * scale, 0, (end - i) * scale + 0.5, track.height);
+        if (data.flags[i] & 2) { // upside down: a dark line below
+          pen.fillStyle = "#000b";
+          pen.fillRect(i * scale, track.height * 0.6, (end - i) * scale + 0.5, track.height * 0.4);
+        }
+        i = end - 1;
+      }
+    }
+  }
+
+  buildControls() {
+    const on = (id, name, act) => document.getElementById(id).addEventListener(name, act);
+    const speeds = document.getElementById("speed");
+    SPEEDS.forEach((speed) => (element("option", "", speeds, `${speed} ×`).value = speed));
+    on("play", "click", () => this.toggle());
+    on("back", "click", () => this.nudge(-1));
+    on("forth", "click", () => this.nudge(1));
+    on("speed", "change", (event) => this.setSpeed(Number(event.target.value)));
+    on("camera", "change", (event) => this.setCamera(event.target.value));
+    on("theme", "click", () => this.setTheme(this.theme === "dark" ? "light" : "dark"));
+    on("help", "click", () => document.getElementById("keys").showModal());
+    this.setSpeed(1);
+    document.addEventListener("keydown", (event) => this.onKey(event));
+    this.buildPointer();
+  }
+
+  buildPointer() {
+    const canvas = this.canvas, fingers = new Map();
+    let spread = 0;
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, event);
+      spread = 0;
+    });
+    const lift = (event) => fingers.delete(event.pointerId);
+    canvas.addEventListener("pointerup", lift);
+    canvas.addEventListener("pointercancel", lift);
+    canvas.addEventListener("pointermove", (event) => {
+      const before = fingers.get(event.pointerId);
+      if (!before) return;
+      fingers.set(event.pointerId, event);
+      if (fingers.size === 2) {
+        const [a, b] = [...fingers.values()];
+        const now = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
+        if (spread) this.zoom(spread / now);
+        spread = now;
+        return;
+      }
+      const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
+      if (event.buttons === 2 || event.shiftKey) this.pan(dx, dy);
+      else this.orbit(dx, dy);
+    });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(event.deltaY * 0.001));
+    }, { passive: false });
+  }
+
+  orbit(dx, dy) {
+    this.view.azimuth -= dx * 0.006;
+    this.view.elevation = Math.max(0.04, Math.min(Math.PI / 2 - 0.001, this.view.elevation + dy * 0.006));
+    this.dirty = true;
+  }
+
+  zoom(factor) {
+    this.view.distance = Math.max(1.5, Math.min(200, this.view.distance * factor));
+    this.dirty = true;
+  }
+
+  pan(dx, dy) {
+    const { azimuth, distance, shift } = this.view, scale = distance * 0.0016;
+    const right = [-Math.sin(azimuth), Math.cos(azimuth), 0], ahead = [-Math.cos(azimuth), -Math.sin(azimuth), 0];
+    this.view.shift = plus(shift, plus(times(right, -dx * scale), times(ahead, dy * scale)));
+    this.dirty = true;
+  }
+
+  onKey(event) {
+    if (event.target.tagName === "SELECT" || event.ctrlKey || event.metaKey || event.altKey) return;
+    const half = Math.round(0.5 / this.footage.control_dt);
+    const faster = (by) => this.setSpeed(SPEEDS[Math.max(0, Math.min(SPEEDS.length - 1, SPEEDS.indexOf(this.speed) + by))]);
+    const cameras = ["follow", "whole", "above"];
+    const actions = {
+      " ": () => this.toggle(),
+      ArrowLeft: () => this.nudge(-half),
+      ArrowRight: () => this.nudge(half),
+      ",": () => this.nudge(-1),
+      ".": () => this.nudge(1),
+      ArrowUp: () => faster(1),
+      ArrowDown: () => faster(-1),
+      Home: () => this.seek(0),
+      End: () => this.seek(this.steps),
+      f: () => this.setCamera(cameras[(cameras.indexOf(this.camera) + 1) % 3]),
+      l: () => this.setTheme(this.theme === "dark" ? "light" : "dark"),
+      "?": () => document.getElementById("keys").showModal(),
+    };
+    const act = actions[event.key] || actions[event.key.toLowerCase()];
+    if (!act) return;
+    event.preventDefault();
+    act();
+  }
+
+  toggle() {
+    if (!this.playing && this.time >= this.steps) this.time = 0;
+    this.setPlaying(!this.playing);
+  }
+
+  setPlaying(playing) {
+    this.playing = playing;
+    document.getElementById("play").textContent = playing ? "❚❚" : "▶";
+    this.dirty = true;
+  }
+
+  setSpeed(speed) {
+    this.speed = speed;
+    document.getElementById("speed").value = speed;
+  }
+
+  setTheme(theme) {
+    this.theme = theme;
+    document.documentElement.classList.toggle("dark", theme === "dark");
+    this.dirty = true;
+  }
+
+  setCamera(camera) {
+    this.camera = camera;
+    document.getElementById("camera").value = camera;
+    Object.assign(this.view, { azimuth: -Math.PI / 2, shift: [0, 0, 0], fit: camera !== "follow" });
+    this.view.elevation = camera === "above" ? Math.PI / 2 - 0.001 : camera === "whole" ? 1.16 : 0.98;
+    this.view.distance = 10.5;
+    this.dirty = true;
+  }
+
+  nudge(steps) {
+    this.setPlaying(false);
+    this.seek(Math.round(this.time) + steps);
+  }
+
+  seek(time) {
+    this.time = Math.max(0, Math.min(this.steps, time));
+    this.dirty = true;
+  }
+
+  // Panels in a grid: as many columns as make them nearest to 4 : 3.
+  layout() {
+    const stage = document.getElementById("stage"), n = this.episodes.length, gap = 8;
+    const width = stage.clientWidth - 2 * gap, height = stage.clientHeight;
+    let best = { error: Infinity };
+    for (let columns = 1; columns <= n; columns++) {
+      const rows = Math.ceil(n / columns);
+      const error = Math.abs(Math.log((width / columns) / (height / rows) / 1.33)) + 0.2 * (columns * rows - n);
+      if (error < best.error) best = { error, columns, rows };
+    }
+    const w = (width - gap * (best.columns - 1)) / best.columns, h = (height - gap * (best.rows - 1)) / best.rows;
+    this.episodes.forEach((episode, i) => {
+      const x = gap + (i % best.columns) * (w + gap), y = Math.floor(i / best.columns) * (h + gap);
+      episode.box = { x, y, w, h };
+      Object.assign(episode.hud.panel.style, { left: `${x}px`, top: `${y}px`, width: `${w}px`, height: `${h}px` });
+    });
+    this.canvas.width = stage.clientWidth * pixels();
+    this.canvas.height = stage.clientHeight * pixels();
+    this.drawTracks();
+    this.dirty = true;
+  }
+
+  // Which choice, flags and sums hold at a time: those of the control step that led there.
+  index(episode) {
+    return Math.max(0, Math.min(episode.data.steps, Math.ceil(this.time - 1e-6)) - 1);
+  }
+
+  scene(episode, pose) {
+    const look = THEMES[this.theme], choice = episode.data.choice[this.index(episode)] ?? -1;
+    const tint = this.colourOf(choice), shin = rgb(look.shin);
+    const things = [];
+    geomPoses(this.footage.skeleton, pose).forEach(({ position, rotation }, i) => {
+      const geom = this.footage.skeleton.geoms[i];
+      const part = geom.name.split("_")[0];
+      const colour = part === "shin" ? shin : part === "thigh" ? mix(tint, shin, 0.25) : tint;
+      things.push({
+        mesh: this.renderer.capsule, model: matrix(rotation, position), size: [0, 0, geom.half], radius: geom.radius,
+        kind: 0, colour,
+      });
+    });
+    for (const [x, y, halfX, halfY] of episode.walls) {
+      const half = episode.wall_height / 2;
+      things.push({
+        mesh: this.renderer.box, model: matrix(IDENTITY, [x, y, half]), size: [halfX, halfY, half], radius: 0,
+        kind: 1, colour: rgb(look.wall),
+      });
+    }
+    if (episode.goal) this.flag(things, episode.goal);
+    const size = 400;
+    things.push({
+      mesh: this.floor ??= this.renderer.mesh({
+        normals: [0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1],
+        offsets: [-size, -size, 0, size, -size, 0, size, size, 0, -size, size, 0], index: [0, 1, 2, 0, 2, 3],
+      }),
+      model: matrix(IDENTITY, [pose[0], pose[1], 0]), size: [0, 0, 0], radius: 0, flat: true, kind: 2, colour: [1, 1, 1],
+    });
+    things.push({
+      mesh: episode.ribbon, count: 6 * Math.min(Math.ceil(this.time), episode.data.steps),
+      model: matrix(IDENTITY, [0, 0, 0]), size: [0, 0, 0], radius: 0, flat: true, kind: 3, colour: [1, 1, 1],
+    });
+    return { things, ...this.cameraOf(episode, pose), uniforms: this.uniforms(episode, pose, look) };
+  }
+
+  flag(things, [x, y]) {
+    const colour = rgb(GOAL), place = { mesh: this.renderer.capsule, kind: 0, colour };
+    things.push({ ...place, model: matrix(IDENTITY, [x, y, 1.2]), size: [0, 0, 1.2], radius: 0.035 });
+    things.push({ ...place, model: matrix(IDENTITY, [x, y, 2.5]), size: [0, 0, 0], radius: 0.17 });
+  }
+
+  uniforms(episode, pose, look) {
+    const { eye, focus } = this.cameraOf(episode, pose);
+    const walls = new Float32Array(4 * MAX_WALLS);
+    episode.walls.slice(0, MAX_WALLS).forEach((wall, i) => walls.set(wall, 4 * i));
+    const goal = episode.goal ? [...episode.goal, episode.goal_radius, 1] : [0, 0, 0, 0];
+    return {
+      uEye: eye, uFocus: [pose[0], pose[1], 0.5], uBack: rgb(look.back), uLine: rgb(look.line), uDark: look.dark,
+      uGoal: goal, uStart: [...episode.start, 0, 1], uGoalColour: rgb(GOAL), uWalls: walls,
+      uNumWalls: Math.min(episode.walls.length, MAX_WALLS),
+      uFog: Math.max(18, Math.hypot(...minus(eye, focus)) * (this.view.fit ? 1.6 : 1.1)),
+    };
+  }
+
+  cameraOf(episode, pose) {
+    const { box } = episode, aspect = box.w / box.h;
+    let { distance } = this.view;
+    let target = [pose[0], pose[1], 0.4];
+    if (this.view.fit) {
+      const [x, y, halfX, halfY] = episode.extent;
+      target = [x, y, 0];
+      const tall = this.camera === "above" ? halfY : halfY * 0.86 + 1;
+      distance *= (1.04 * Math.max(tall, halfX / aspect)) / Math.tan(FOV / 2) / 10.5 + (this.camera === "above" ? 0.2 : 0);
+    }
+    target = plus(target, this.view.shift);
+    const { azimuth, elevation } = this.view, flat = Math.cos(elevation);
+    const eye = plus(target, times([Math.cos(azimuth) * flat, Math.sin(azimuth) * flat, Math.sin(elevation)], distance));
+    const up = [-Math.cos(azimuth) * Math.sin(elevation), -Math.sin(azimuth) * Math.sin(elevation), flat];
+    const view = multiply(perspective(FOV, aspect, 0.1, 900), lookAt(eye, target, up));
+    return { view, eye, focus: [pose[0], pose[1], 0.4] };
+  }
+
+  draw() {
+    const scale = pixels();
+    if (this.renderer) this.renderer.wipe(rgb(THEMES[this.theme].back), this.canvas.width, this.canvas.height);
+    for (const episode of this.episodes) {
+      const pose = poseAt(episode.data, this.time);
+      const { x, y, w, h } = episode.box;
+      if (this.renderer) {
+        const rectangle = [x, this.canvas.height / scale - y - h, w, h].map((v) => Math.round(v * scale));
+        this.renderer.render(this.scene(episode, pose), rectangle);
+      } else {
+        this.drawFlat(episode, pose, scale);
+      }
+      this.drawCard(episode);
+    }
+    this.head.style.left = `${(100 * this.time) / this.steps}%`;
+    const dt = this.footage.control_dt;
+    document.getElementById("clock").textContent =
+      `${(this.time * dt).toFixed(2)} s of ${(this.steps * dt).toFixed(2)} s · control step ${Math.round(this.time)}`;
+    document.getElementById("tracks").setAttribute("aria-valuenow", Math.round(this.time));
+  }
+
+  drawCard(episode) {
+    const { hud, data, goal, start } = episode, i = this.index(episode), begun = this.time > 0;
+    const choice = data.choice[i] ?? -1;
+    hud.chip.textContent = choice < 0 ? "flat policy" : `${ARROWS[choice]} ${this.footage.directions[choice]}`;
+    hud.chip.style.background = choice < 0 ? this.footage.flat_colour : this.footage.colours[choice];
+    hud.return.textContent = (begun ? data.total[i] : 0).toFixed(1);
+    const place = poseAt(data, this.time);
+    const away = goal ? Math.hypot(place[0] - goal[0], place[1] - goal[1]) : Math.hypot(place[0] - start[0], place[1] - start[1]);
+    hud.distance.textContent = `${away.toFixed(2)} m`;
+    const decision = Math.floor(i / episode.option_steps);
+    if (hud.value) hud.value.textContent = data.value[decision].toFixed(1);
+    if (hud.odds) hud.odds.forEach((bar, k) => (bar.style.height = `${(100 * data.odds[4 * decision + k]) / 255}%`));
+    const over = this.time >= data.steps;
+    const [text, colour] = over ? [episode.outcome, episode.good ? "#009E73" : "#5c616b"]
+      : begun && data.flags[i] & 2 ? ["upside down", "#B3261E"]
+      : begun && data.flags[i] & 1 ? ["fallen", "#B3261E"] : ["", ""];
+    hud.badge.classList.toggle("on", Boolean(text));
+    if (text) {
+      hud.badge.textContent = text;
+      hud.badge.style.background = colour;
+    }
+    this.drawSpark(hud.spark, data, i);
+  }
+
+  // The return so far, and what is still to come.
+  drawSpark(spark, data, now) {
+    if (!spark.clientWidth) return;
+    spark.width = spark.clientWidth * pixels();
+    spark.height = spark.clientHeight * pixels();
+    const pen = spark.getContext("2d");
+    let low = 0, high = 0;
+    for (const total of data.total) {
+      low = Math.min(low, total);
+      high = Math.max(high, total);
+    }
+    const x = (i) => (i / Math.max(this.steps - 1, 1)) * (spark.width - 4) + 2;
+    const y = (v) => spark.height - 3 - ((v - low) / (high - low || 1)) * (spark.height - 6);
+    const ink = getComputedStyle(document.body).color;
+    for (const [from, to, alpha] of [[0, data.steps - 1, 0.22], [0, now, 1]]) {
+      pen.globalAlpha = alpha;
+      pen.strokeStyle = pen.fillStyle = ink;
+      pen.lineWidth = 1.4 * pixels();
+      pen.beginPath();
+      for (let i = from; i <= to; i += Math.max(1, Math.floor(data.steps / 400))) pen.lineTo(x(i), y(data.total[i]));
+      pen.stroke();
+    }
+    pen.beginPath();
+    pen.arc(x(now), y(data.total[now] ?? 0), 2.2 * pixels(), 0, 7);
+    pen.fill();
+  }
+
+  // Without WebGL: the same from above, with the pen of the page.
+  drawFlat(episode, pose, scale) {
+    const pen = this.pen ??= this.canvas.getContext("2d"), look = THEMES[this.theme], { x, y, w, h } = episode.box;
+    pen.save();
+    pen.setTransform(scale, 0, 0, scale, 0, 0);
+    pen.beginPath();
+    pen.rect(x, y, w, h);
+    pen.clip();
+    pen.fillStyle = look.back;
+    pen.fillRect(x, y, w, h);
+    const [cx, cy, halfX, halfY] = this.view.fit ? episode.extent : [pose[0], pose[1], 0.42 * this.view.distance, 0.42 * this.view.distance];
+    const zoom = Math.min(w / halfX, h / halfY) / 2.1;
+    pen.translate(x + w / 2, y + h / 2);
+    pen.scale(zoom, -zoom);
+    pen.translate(-cx - this.view.shift[0], -cy - this.view.shift[1]);
+    pen.fillStyle = look.wall;
+    for (const [wx, wy, hx, hy] of episode.walls) pen.fillRect(wx - hx, wy - hy, 2 * hx, 2 * hy);
+    if (episode.goal) {
+      pen.fillStyle = GOAL;
+      pen.beginPath();
+      pen.arc(...episode.goal, episode.goal_radius, 0, 7);
+      pen.fill();
+    }
+    const { data } = episode, until = Math.min(Math.ceil(this.time), data.steps);
+    const line = (ax, ay, bx, by, width, colour) => {
+      pen.lineWidth = width;
+      pen.lineCap = "round";
+      pen.strokeStyle = `rgb(${colour.map((v) => Math.round(255 * v))})`;
+      pen.beginPath();
+      pen.moveTo(ax, ay);
+      pen.lineTo(bx, by);
+      pen.stroke();
+    };
+    const at = (i, k) => data.frames[i * data.width + k];
+    for (let i = 0; i < until; i++) line(at(i, 0), at(i, 1), at(i + 1, 0), at(i + 1, 1), 0.1, this.colourOf(data.choice[i]));
+    const tint = this.colourOf(data.choice[this.index(episode)] ?? -1);
+    geomPoses(this.footage.skeleton, pose).forEach(({ position, rotation }, i) => {
+      const geom = this.footage.skeleton.geoms[i], along = times([rotation[2], rotation[5], rotation[8]], geom.half);
+      const colour = geom.name.startsWith("shin") ? rgb(look.shin) : tint;
+      const [a, b] = [minus(position, along), plus(position, along)];
+      line(a[0], a[1], b[0], b[1], 2 * geom.radius, colour);
+    });
+    pen.restore();
+  }
+
+  // Where OpenGL runs in software: coarser pictures rather than jerky ones.
+  spare(elapsed) {
+    this.slow = elapsed > 0.06 ? (this.slow || 0) + 1 : Math.max(0, (this.slow || 0) - 0.25);
+    if (this.slow < 6 || fineness <= 0.5) return;
+    this.slow = 0;
+    fineness = Math.max(0.5, fineness * 0.7);
+    this.layout();
+  }
+
+  frame(now) {
+    const elapsed = Math.min((now - (this.last ?? now)) / 1000, 0.25);
+    this.last = now;
+    if (this.playing) {
+      this.time = Math.min(this.steps, this.time + (elapsed * this.speed) / this.footage.control_dt);
+      if (this.time >= this.steps) this.setPlaying(false);
+    }
+    if (this.playing || this.dirty) {
+      this.dirty = false;
+      this.draw();
+      if (this.playing) this.spare(elapsed);
+    }
+    requestAnimationFrame((next) => this.frame(next));
+  }
+}
+
+if (typeof document === "undefined") {
+  module.exports = { decode, poseAt, geomPoses }; // to be tested without a browser
+} else {
+  const viewer = new Viewer(JSON.parse(document.getElementById("footage").textContent));
+  window.footwork = viewer;
+  requestAnimationFrame((now) => viewer.frame(now));
+  if (!window.matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.setPlaying(true);
+}

@@ -372,25 +372,21 @@ def _played_on(trained: Trained, engine: str | None) -> Trained:
 
 def _bench(command: Bench, rest: list[str]) -> int:
     from footwork.checkpoint import write_atomically
-    from footwork.study import bench
+    from footwork.doors import tables  # all of it now: whoever presses Ctrl-C will not wait
+    from footwork.study import bench, figures
 
     python = command.rivals_python or sys.executable
     work = bench.Bench(command.quick, command.learning, python, lambda line: print(line, file=sys.stderr))
     work.run()
     report = work.report()
     text = json.dumps(report, indent=2)
-    command.to.mkdir(parents=True, exist_ok=True)
-    write_atomically(command.to / "report.json", text.encode() + b"\n")
     if command.json:
         print(text)
     else:
-        from footwork.doors import tables
-
         tables.show(*tables.bench_tables(report))
-    if report["contestants"]:
-        from footwork.study.figures import bench_figure
-
-        print(f"wrote {bench_figure(command.to / 'bench.png', report)}", file=sys.stderr)
+    command.to.mkdir(parents=True, exist_ok=True)
+    write_atomically(command.to / "report.json", text.encode() + b"\n")
+    print(f"wrote {figures.bench_figure(command.to / 'bench.png', report)}", file=sys.stderr)
     return 0 if work.complete else 130
 
 

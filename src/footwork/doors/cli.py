@@ -1,4 +1,4 @@
-"""The command line: ``footwork list | train | evaluate | transitions | quickstart``.
+"""The command line: ``footwork list | train | evaluate | transitions | quickstart | export``.
 
 Only what a command needs is imported, and only once it is known which command it is:
 ``footwork --help`` answers at once.
@@ -84,6 +84,19 @@ class Quickstart:
     threads: int = 0  # of the physics; 0: all cores. Changes no number
 
 
+@dataclass(frozen=True)
+class Export:
+    """Write a row's policies into a folder with a model card; the folder is then as good as a row's name."""
+
+    row: RowName  # its address, as `footwork list` shows it
+    to: Path  # a folder that does not exist yet
+    runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
+    episodes: int = 1000  # per seed, for the figures of the card
+    seed: int = 1_000_003  # of the episodes
+    onnx: bool = False  # also write ONNX files (extra footwork[onnx])
+    threads: int = 0  # of the physics; 0: all cores. Changes no number
+
+
 def main() -> None:
     """The entry point."""
     sys.exit(run(sys.argv[1:]))
@@ -91,7 +104,7 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command; what a user can mend is one line on stderr and exit status 1, 130 for an interrupt."""
-    commands: Any = List | Train | Evaluate | Transitions | Quickstart
+    commands: Any = List | Train | Evaluate | Transitions | Quickstart | Export
     chosen, rest = tyro.cli(commands, args=arguments, prog="footwork", return_unknown_args=True)
     if rest and not isinstance(chosen, Train):
         print(f"footwork: unknown options: {' '.join(rest)}; see footwork {arguments[0]} --help", file=sys.stderr)
@@ -102,6 +115,7 @@ def run(arguments: list[str]) -> int:
         Evaluate: _evaluate,
         Transitions: _transitions,
         Quickstart: _quickstart,
+        Export: _export,
     }
     try:
         return actions[type(chosen)](chosen, rest)
@@ -223,6 +237,15 @@ def _quickstart(command: Quickstart, rest: list[str]) -> int:
     from footwork.doors.quickstart import quickstart
 
     quickstart(command.to, command.seed, command.steps, command.threads)
+    return 0
+
+
+def _export(command: Export, rest: list[str]) -> int:
+    from footwork.doors.export import export
+
+    _at_least_one("episodes", command.episodes)
+    card = export(command.row, command.to, command.runs, command.episodes, command.seed, command.threads, command.onnx)
+    print(f"{command.row}: exported; the model card is {card}")
     return 0
 
 

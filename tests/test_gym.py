@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -390,3 +391,13 @@ def test_every_number_of_an_observation_has_a_meaning_and_bounds(fields):
     assert (low < high).all()
     assert np.isfinite([low, high]).all()
     assert set(MAZES) >= {"u"}
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_the_pages_of_the_environments_are_those_the_code_makes(name, monkeypatch):
+    root = Path(__file__).parents[1]
+    monkeypatch.syspath_prepend(str(root / "tools"))
+    import environment_pages
+
+    written = (root / "docs" / "environments" / f"{name}.md").read_text(encoding="utf-8")
+    assert written == environment_pages.page(name), "run tools/environment_pages.py"

@@ -94,6 +94,19 @@ class Quickstart:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Write a row's policies into a folder with a model card; the folder is then as good as a row's name."""
+
+    row: RowName  # its address, as `footwork list` shows it
+    to: Path  # a folder that does not exist yet
+    runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
+    episodes: int = 1000  # per seed, for the figures of the card
+    seed: int = 1_000_003  # of the episodes
+    onnx: bool = False  # also write ONNX files (extra footwork[onnx])
+    threads: int = 0  # of the physics; 0: all cores. Changes no number
+
+
+@dataclass(frozen=True)
 class Replay:
     """Write an HTML page that shows the ant in 3-D: play, scrub, follow. It opens from disk and fetches nothing."""
 
@@ -213,7 +226,18 @@ def _processor() -> str:
 def run(arguments: list[str]) -> int:
     """Run one command; what a user can mend is one line on stderr and exit status 1, 130 for an interrupt."""
     commands: Any = (
-        List | Train | Evaluate | Transitions | Quickstart | Replay | Video | Bench | Reproduce | Figures | Report
+        List
+        | Train
+        | Evaluate
+        | Transitions
+        | Quickstart
+        | Export
+        | Replay
+        | Video
+        | Bench
+        | Reproduce
+        | Figures
+        | Report
     )
     chosen, rest = tyro.cli(commands, args=arguments, prog="footwork", return_unknown_args=True)
     if rest and not isinstance(chosen, Train):
@@ -225,6 +249,7 @@ def run(arguments: list[str]) -> int:
         Evaluate: _evaluate,
         Transitions: _transitions,
         Quickstart: _quickstart,
+        Export: _export,
         Replay: _replay,
         Video: _video,
         Bench: _bench,
@@ -444,6 +469,15 @@ def _video(command: Video, rest: list[str]) -> int:
     say: Callable[[str], None] = lambda line: print(f"footwork: {line}", file=sys.stderr)  # noqa: E731
     path = video(filmed.footage, command.to.suffix, look, say).save(command.to)
     print(f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB")
+
+
+def _export(command: Export, rest: list[str]) -> int:
+    from footwork.doors.export import export
+
+    _at_least_one("episodes", command.episodes)
+    card = export(command.row, command.to, command.runs, command.episodes, command.seed, command.threads, command.onnx)
+    print(f"{command.row}: exported; the model card is {card}")
+
     return 0
 
 

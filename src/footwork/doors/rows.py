@@ -184,7 +184,8 @@ def _pack(state: EnvState) -> tuple[EnvState, np.ndarray]:
 
 def _unpack(state: EnvState, packed: Any) -> EnvState:
     *parts, action, diverged = jnp.split(packed, np.cumsum(_SIZES)[:-1], axis=1)
-    physics = PhysicsState(*parts, diverged[:, 0] > 0, state.previous.engine)
+    qpos, qvel, contact, collision = parts
+    physics = PhysicsState(qpos, qvel, contact, collision, diverged[:, 0] > 0, state.previous.engine)
     return state._replace(physics=physics, action=action, stale=jnp.zeros_like(state.held))
 
 

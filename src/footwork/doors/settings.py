@@ -26,6 +26,7 @@ MazeMap = str | Sequence[Any]
 FASTEST = 5.0  # m/s that no ant walks for long: how far a coordinate can get on a floor without walls
 MASTER_ROW = "maze/hrl/symmetric-interleaved"  # whose fields a master's environment has unless told otherwise
 MASTER_STEPS = find_row(MASTER_ROW).option_steps
+_MASTER_TASK = find_row(MASTER_ROW).task
 MASTER_SUB_POLICIES = "walker/symmetric-interleaved"
 
 
@@ -197,8 +198,8 @@ def ant_maze_options(
     option_steps: int = MASTER_STEPS,
     deterministic_sub_policies: bool = False,
     potential: Potential = "geodesic",
-    goal_reward: float | None = None,
-    xy_scale: float | None = None,
+    goal_reward: float = _MASTER_TASK.weights.goal,
+    xy_scale: float = _MASTER_TASK.xy_scale,
     **maze_fields: Any,
 ) -> Setting:
     """AntMaze for a master: one of four sub-policies acts for ``option_steps`` control steps, whose rewards are summed.
@@ -209,18 +210,12 @@ def ant_maze_options(
         sub_policies: a row (the packaged one is preferred), a folder made by ``footwork export``, or the policies.
         option_steps: control steps per choice, the paper's k.
         deterministic_sub_policies: they act by their mode instead of a sample.
-        potential: as in :func:`ant_maze`.
-        goal_reward: as in :func:`ant_maze`.
-        xy_scale: as in :func:`ant_maze`.
+        potential: progress along the straight line, or around the walls (for one goal).
+        goal_reward: once, on arrival; of the task's reward.
+        xy_scale: factor on observed coordinates; never on ``achieved_goal`` and ``desired_goal``.
         **maze_fields: the other fields of :func:`ant_maze`.
     """
-    usual = find_row(MASTER_ROW).task
-    setting = ant_maze(
-        potential=potential,
-        goal_reward=usual.weights.goal if goal_reward is None else goal_reward,
-        xy_scale=usual.xy_scale if xy_scale is None else xy_scale,
-        **maze_fields,
-    )
+    setting = ant_maze(potential=potential, goal_reward=goal_reward, xy_scale=xy_scale, **maze_fields)
     if not isinstance(sub_policies, SubPolicies):
         sub_policies = _load(sub_policies, setting.task.robot)
     sub_policies = replace(sub_policies, deterministic=deterministic_sub_policies)

@@ -1,0 +1,94 @@
+"""Stable-Baselines3's PPO on Footwork: as a master that chooses sub-policies, or as a flat policy that walks.
+
+    pip install 'footwork[sb3]'
+    python examples/sb3_ppo.py master                # AntMazeOptions-v0: minutes on two cores
+    python examples/sb3_ppo.py flat --steps 2000000  # AntWalker-v0
+
+Prints what the trained policy does over fresh episodes: of a master how often it came within
+1.0 m of the goal, of a flat policy how fast it walked.
+"""
+
+import argparse
+import time
+
+import numpy as np
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+from footwork.doors.sb3 import make_vec_env
+
+MASTER, FLAT = "footwork/AntMazeOptions-v0", "footwork/AntWalker-v0"
+NEAR = 1.0  # m
+FIELDS = {}  # of the environments, such as {"maze_map": "medium", "option_steps": 25}
+NETWORK = {"net_arch": {"pi": [64, 64], "vf": [64, 64]}}
+
+
+def master(args):
+    """A master makes few decisions, each worth the sum of 50 rewards: many rows, short rollouts, scaled rewards."""
+    env = VecNormalize(make_vec_env(MASTER, args.rows or 64, **FIELDS), norm_obs=False, gamma=0.99)
+    settings = {"n_steps": 4, "batch_size": 32, "n_epochs": 10, "learning_rate": 1e-3, "policy_kwargs": NETWORK}
+    model = learn(env, settings, args.steps or 40_000, args)
+    seen = make_vec_env(MASTER, args.episodes, every_info=True, **FIELDS)
+    closest, flipped = play(model, seen, "goal_distance", np.minimum, "flipped")
+    reached = np.mean(closest <= NEAR)
+    print(
+        f"{args.episodes} episodes: {100 * reached:.1f} % within {NEAR} m, {100 * np.mean(flipped):.1f} % turned over"
+    )
+    return reached
+
+
+def flat(args):
+    """The paper's batch of 2048 steps, in minibatches of 64."""
+    env = VecNormalize(make_vec_env(FLAT, args.rows or 32, **FIELDS), norm_obs=False, norm_reward=False)
+    settings = {"n_steps": 64, "batch_size": 64, "n_epochs": 10, "learning_rate": 3e-4, "policy_kwargs": NETWORK}
+    model = learn(env, settings, args.steps or 1_000_000, args)
+    seen = make_vec_env(FLAT, args.episodes, every_info=True, **FIELDS)
+    progress, fallen = play(model, seen, "reward_progress", np.add, "fallen")
+    task = seen.env.setting.task
+    speed = np.mean(progress) / task.episode_steps  # time after a fall counts
+    print(f"{args.episodes} episodes: {speed:.2f} m/s, {100 * np.mean(fallen):.1f} % fell")
+    return speed
+
+
+def learn(env, settings, steps, args):
+    """Train and say how fast."""
+    model = PPO("MlpPolicy", env, seed=args.seed, device="cpu", verbose=args.verbose, **settings)
+    begun = time.monotonic()
+    model.learn(steps)
+    seconds = time.monotonic() - begun
+    print(f"PPO: {model.num_timesteps} steps in {seconds:.0f} s, {model.num_timesteps / seconds:.0f} per second")
+    env.close()
+    return model
+
+
+def play(model, env, figure, combine, flag):
+    """The first episode of every row: ``figure`` combined over its steps, and whether ``flag`` was ever up."""
+    env.seed(1_000_003)
+    obs, total, flagged = env.reset(), None, np.zeros(env.num_envs, bool)
+    playing = np.ones(env.num_envs, bool)
+    while playing.any():
+        action, _ = model.predict(obs)
+        obs, _, done, infos = env.step(action)
+        now = np.array([info[figure] for info in infos])
+        total = now if total is None else np.where(playing, combine(total, now), total)
+        flagged |= playing & np.array([info[flag] for info in infos])
+        playing &= ~done
+    env.close()
+    return total, flagged
+
+
+def main(arguments=None):
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("kind", choices=("master", "flat"))
+    parser.add_argument("--steps", type=int, help="of the environment: decisions of a master, control steps else")
+    parser.add_argument("--rows", type=int, help="environments side by side")
+    parser.add_argument("--episodes", type=int, default=200, help="of the evaluation")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--verbose", type=int, default=0)
+    args = parser.parse_args(arguments)
+    return master(args) if args.kind == "master" else flat(args)
+
+
+if __name__ == "__main__":
+    main()

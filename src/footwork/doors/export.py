@@ -1,0 +1,193 @@
+"""Policies out: a folder of weights, config and a model card with figures measured now.
+
+The folder is a finished run like any other, so that it is accepted wherever a row is.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from footwork import checkpoint
+from footwork.arena import DIRECTIONS
+from footwork.checkpoint import write_atomically
+from footwork.evaluate import evaluate
+from footwork.record import RunDir, config_to_json
+from footwork.study.runs import NEEDED, PACKAGED, find_needed, find_trained, packaged
+from footwork.tasks.task import SUCCESS_RADII
+from footwork.train import Trained
+
+Addition = Callable[[Trained, Trained | None, Path], Sequence[Path]]
+
+
+def export(
+    address: str,
+    to: Path,
+    runs: Path,
+    episodes: int = 1000,
+    seed: int = 1_000_003,
+    num_threads: int = 0,
+    onnx: bool = False,
+    additions: Sequence[Addition] = (),
+) -> Path:
+    """Write what an address means into the folder ``to``; returns the model card.
+
+    Args:
+        address: a row, or the folder of a run or export.
+        to: a folder that does not exist or is empty.
+        runs: where runs are kept.
+        episodes: per seed, for the card's figures.
+        seed: of the episodes.
+        num_threads: of the physics; changes no number.
+        onnx: also write ONNX files, those of the first seed.
+        additions: each adds files to the folder, such as a replay, and returns their paths.
+
+    Raises:
+        ValueError: the address is unknown.
+        RunError: nothing has been trained there, or the folder is not empty.
+        ImportError: ``onnx`` is asked for and not installed.
+        CheckpointError: a file cannot be written.
+    """
+    if onnx:
+        from footwork.doors.onnx import write_onnx  # what is missing is said before anything is written
+    trained = find_trained(address, runs)
+    needed = find_needed(trained, runs)
+    meta = _meta(trained)
+    run = RunDir.create(to, {"experiment": config_to_json(trained.experiment), "seeds": list(trained.seeds)})
+    with run.lock():
+        run.save_policy(trained.params, meta)
+        if needed is not None:
+            checkpoint.save(to / NEEDED, needed.params, _meta(needed))
+        files: list[Path] = list(write_onnx(trained, to)) if onnx else []
+        for add in additions:
+            files += add(trained, needed, to)
+        report = evaluate(trained, needed, episodes, seed, num_threads=num_threads)
+        report["source"] = trained.experiment.name  # not where it lay on this machine
+        write_atomically(to / "evaluation.json", json.dumps(report, indent=2).encode() + b"\n")
+        card = to / "README.md"
+        write_atomically(card, _card(trained, needed, meta, report, seed, files, to).encode())
+        run.finish({"row": trained.experiment.name, "seeds": list(trained.seeds), "steps": meta["steps"]})
+    return card
+
+
+def _meta(trained: Trained) -> dict[str, Any]:
+    """What the file of policies says of itself; of what was packaged with them, nothing that is not there."""
+    if trained.source == PACKAGED:
+        with resources.as_file(packaged(trained.experiment.name)) as path:
+            meta = checkpoint.load_arrays(path)[1]
+    else:
+        meta = checkpoint.load_arrays(Path(trained.source))[1]
+    return {name: value for name, value in meta.items() if name != "from"}
+
+
+def _card(
+    trained: Trained,
+    needed: Trained | None,
+    meta: dict[str, Any],
+    report: dict[str, Any],
+    seed: int,
+    files: list[Path],
+    to: Path,
+) -> str:
+    """The model card."""
+    experiment, versions = trained.experiment, meta["versions"]
+    kind = "A master" if experiment.is_master else "Sub-policies" if experiment.is_walker else "A flat policy"
+    seeds = " ".join(map(str, meta.get("batch", trained.seeds)))
+    arena, robot = experiment.task.arena.name, experiment.task.robot.name
+    stands = (
+        ""
+        if needed is None
+        else (
+            f" It chooses every {experiment.option_steps} control steps among the sub-policies of "
+            f"`{needed.experiment.name}`, which are in this folder too."
+        )
+    )
+    lines = [
+        "---",
+        "library_name: footwork",
+        "license: mit",
+        "tags: [reinforcement-learning, hierarchical-reinforcement-learning, locomotion, mujoco, gymnasium]",
+        "---",
+        "",
+        f"# {experiment.name}",
+        "",
+        f"{kind} for {experiment.task.name} in arena `{arena}`, ant `{robot}`.{stands}",
+        "",
+        "## How it was trained",
+        "",
+        f"`footwork train {experiment.name} --seeds {seeds}`, {meta['steps']:,} control steps per run, with "
+        + ", ".join(f"{name} {versions[name]}" for name in ("footwork", "jax", "mujoco"))
+        + ". `config.json` holds every field, those changed on the command line too.",
+        "",
+        "## What it does",
+        "",
+        *_figures(report, seed),
+        "",
+        "## How to use it",
+        "",
+        *_usage(trained, to.name),
+        "",
+        "## Files",
+        "",
+        "* `policy.safetensors`: parameters with leading axes [seed, policy of that seed]; no pickle",
+        *([f"* `{NEEDED}`: the sub-policies it stands on"] if needed else []),
+        "* `config.json`, `evaluation.json`, `DONE`: the run, its figures, its end",
+        *(f"* `{path.relative_to(to)}`" for path in files),
+        "",
+        "## Limits",
+        "",
+        "Trained and measured in simulation, on one kind of ant and in one arena. It knows nothing of another.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _figures(report: dict[str, Any], seed: int) -> list[str]:
+    """The evaluation as a table."""
+    interval = report["interval"]
+    rows = []
+    if report["success"] is not None:
+        rows += [
+            (
+                f"came within {radius} m of the goal",
+                _rate(report["success"][str(radius)], interval["success"][str(radius)]),
+            )
+            for radius in SUCCESS_RADII
+        ]
+    if "speed_mps" in report:
+        speeds = report["speed_mps"]
+        rows += [(f"speed {name}", f"{sum(speeds[name]) / len(speeds[name]):.2f} m/s") for name in DIRECTIONS]
+    rows += [
+        (f"{word} at some time", _rate(report[f"{what}_rate"], interval[f"{what}_rate"]))
+        for what, word in (("fall", "fell"), ("flip", "turned over"))
+    ]
+    low, high = interval["progress_m"]
+    rows.append(("progress per episode", f"{report['progress_m']:.2f} m [{low:.2f}, {high:.2f}]"))
+    if report["time_to_goal_s"] is not None:
+        rows.append(("time to the goal", f"{report['time_to_goal_s']:.1f} s"))
+    seeds = ", ".join(map(str, report["seeds"]))
+    said = f"{report['episodes']} episodes (seeds {seeds}; episodes from seed {seed}), sampled actions, 95 % intervals:"
+    return [said, "", "| | |", "|---|---|", *(f"| {what} | {figure} |" for what, figure in rows)]
+
+
+def _usage(trained: Trained, folder: str) -> list[str]:
+    experiment = trained.experiment
+    where = shlex.quote(folder)
+    lines = ["```", f"footwork evaluate {where}"]
+    if experiment.is_walker:
+        lines += [f"footwork transitions {where}", f"footwork train maze/hrl/plain --sub-policies {where}"]
+    lines += ["```", "", "```python"]
+    lines += ["from footwork.doors.policies import load_policy", ""]
+    if experiment.is_walker:
+        lines += [f'policy = load_policy("{folder}", direction="up")']
+    else:
+        lines += [f'policy = load_policy("{folder}")']
+    lines += ["action, _ = policy.predict(obs, deterministic=True)", "```"]
+    return lines
+
+
+def _rate(rate: float, interval: list[float]) -> str:
+    return f"{100 * rate:.1f} % [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"

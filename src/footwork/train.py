@@ -182,6 +182,13 @@ def update_all(
 
 def iterate(experiment: Experiment, env: Environment, learning: Learning, seed: int) -> tuple[Learning, Metrics]:
     """One rollout and one update; metrics have the leading axis of ``learning.learners``."""
+    return iterate_in_sight(experiment, env, learning, seed)[:2]
+
+
+def iterate_in_sight(
+    experiment: Experiment, env: Environment, learning: Learning, seed: int
+) -> tuple[Learning, Metrics, Transition]:
+    """:func:`iterate`, and the rollout that was learned from, axes [R, T, N, ...], for those who show it."""
     policy, config = experiment.policy(), experiment.ppo
     root = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), learning.iteration)
     collect_key, update_key = jax.random.split(root)
@@ -189,7 +196,7 @@ def iterate(experiment: Experiment, env: Environment, learning: Learning, seed: 
         env, policy, learning.learners.params, learning.carry, collect_key, config.num_steps
     )
     learners, update_metrics = update_all(policy, config, learning.learners, transition, update_key)
-    return Learning(learning.iteration + 1, learners, carry), {**metrics, **update_metrics}
+    return Learning(learning.iteration + 1, learners, carry), {**metrics, **update_metrics}, transition
 
 
 def train(

@@ -1,4 +1,4 @@
-"""The command line: ``footwork list | train | evaluate | transitions | quickstart | replay | video``.
+"""The command line: ``footwork list | train | evaluate | transitions | quickstart | replay | video | play``.
 
 Only what a command needs is imported, and only once it is known which command it is:
 ``footwork --help`` answers at once.
@@ -119,6 +119,18 @@ class Video:
     quality: int = 80  # 1..100
 
 
+@dataclass(frozen=True)
+class Play:
+    """Serve a page where one watches a master, is the master, draws a maze and lets a master learn it."""
+
+    row: RowName = "maze/hrl/symmetric-interleaved"  # a master, or its run directory
+    runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
+    host: str = "127.0.0.1"  # other addresses open the page to other machines
+    port: int = 8765  # 0: any free one
+    seats: int = 2  # visitors at once, each with ants of their own; others wait
+    lesson_steps: int = 1_000_000  # control steps of a master that learns on the page
+
+
 def main() -> None:
     """The entry point."""
     sys.exit(run(sys.argv[1:]))
@@ -126,7 +138,7 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command; what a user can mend is one line on stderr and exit status 1, 130 for an interrupt."""
-    commands: Any = List | Train | Evaluate | Transitions | Quickstart | Replay | Video
+    commands: Any = List | Train | Evaluate | Transitions | Quickstart | Replay | Video | Play
     chosen, rest = tyro.cli(commands, args=arguments, prog="footwork", return_unknown_args=True)
     if rest and not isinstance(chosen, Train):
         print(f"footwork: unknown options: {' '.join(rest)}; see footwork {arguments[0]} --help", file=sys.stderr)
@@ -139,6 +151,7 @@ def run(arguments: list[str]) -> int:
         Quickstart: _quickstart,
         Replay: _replay,
         Video: _video,
+        Play: _play,
     }
     try:
         return actions[type(chosen)](chosen, rest)
@@ -299,6 +312,13 @@ def _video(command: Video, rest: list[str]) -> int:
     say: Callable[[str], None] = lambda line: print(f"footwork: {line}", file=sys.stderr)  # noqa: E731
     path = video(filmed.footage, command.to.suffix, look, say).save(command.to)
     print(f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB")
+    return 0
+
+
+def _play(command: Play, rest: list[str]) -> int:
+    from footwork.doors.play import play
+
+    play(command.row, command.runs, command.host, command.port, command.seats, command.lesson_steps)
     return 0
 
 

@@ -226,6 +226,13 @@ def iterate(
     experiment: Experiment, env: Environment, learning: Learning, seed: int, compiling: Future[None] | None = None
 ) -> tuple[Learning, Metrics]:
     """One rollout and one update, which waits for ``compiling``; metrics have the leading axis of the learners."""
+    return iterate_in_sight(experiment, env, learning, seed, compiling)[:2]
+
+
+def iterate_in_sight(
+    experiment: Experiment, env: Environment, learning: Learning, seed: int, compiling: Future[None] | None = None
+) -> tuple[Learning, Metrics, Transition]:
+    """:func:`iterate`, and the rollout that was learned from, axes [R, T, N, ...], for those who show it."""
     policy, config = experiment.policy(), experiment.ppo
     root = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), learning.iteration)
     collect_key, update_key = jax.random.split(root)
@@ -236,7 +243,7 @@ def iterate(
     if compiling is not None:
         compiling.result()
     learners, update_metrics = update_all(policy, config, learning.learners, transition, update_key)
-    return Learning(learning.iteration + 1, learners, carry), {**metrics, **update_metrics}
+    return Learning(learning.iteration + 1, learners, carry), {**metrics, **update_metrics}, transition
 
 
 def _with_handovers(experiment: Experiment, learners: ppo.TrainState, transition: Transition) -> Transition:

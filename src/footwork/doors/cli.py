@@ -141,6 +141,18 @@ class Video:
 
 
 @dataclass(frozen=True)
+class Play:
+    """Serve a page where one watches a master, is the master, draws a maze and lets a master learn it."""
+
+    row: RowName = "maze/hrl/symmetric-interleaved"  # a master, or its run directory
+    runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
+    host: str = "127.0.0.1"  # other addresses open the page to other machines
+    port: int = 8765  # 0: any free one
+    seats: int = 2  # visitors at once, each with ants of their own; others wait
+    lesson_steps: int = 1_000_000  # control steps of a master that learns on the page
+
+
+@dataclass(frozen=True)
 class Bench:
     """Measure how fast all this is on this machine: beside the physics alone, and beside what others use.
 
@@ -234,6 +246,7 @@ def run(arguments: list[str]) -> int:
         | Export
         | Replay
         | Video
+        | Play
         | Bench
         | Reproduce
         | Figures
@@ -252,6 +265,7 @@ def run(arguments: list[str]) -> int:
         Export: _export,
         Replay: _replay,
         Video: _video,
+        Play: _play,
         Bench: _bench,
         Reproduce: _reproduce,
         Figures: _figures,
@@ -478,6 +492,13 @@ def _export(command: Export, rest: list[str]) -> int:
     card = export(command.row, command.to, command.runs, command.episodes, command.seed, command.threads, command.onnx)
     print(f"{command.row}: exported; the model card is {card}")
 
+    return 0
+
+
+def _play(command: Play, rest: list[str]) -> int:
+    from footwork.doors.play import play
+
+    play(command.row, command.runs, command.host, command.port, command.seats, command.lesson_steps)
     return 0
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from footwork.arena import DIRECTIONS
+from footwork.arena import DIRECTIONS, Arena
 from footwork.checkpoint import write_atomically
 from footwork.footage import Footage, film
 from footwork.physics.skeleton import skeleton
@@ -59,9 +59,7 @@ class Replay:
     def html(self) -> str:
         """The page."""
         text = json.dumps(_payload(self.footage), separators=(",", ":"), allow_nan=False)
-        parts = {name: _asset(name) for name in ("page.html", "style.css", "viewer.js")}
-        page = parts["page.html"].replace("{{style}}", parts["style.css"]).replace("{{title}}", html.escape(self.title))
-        return page.replace("{{script}}", parts["viewer.js"]).replace("{{footage}}", text.replace("<", "\\u003c"))
+        return page("replay.html", self.title, ("style.css",), ("scene.js", "replay.js"), text)
 
     def save(self, path: Path) -> Path:
         """Write the page."""
@@ -137,6 +135,22 @@ def find_policies(row: str, runs: Path) -> Trained:
     return find_trained(row, runs)
 
 
+def page(template: str, title: str, styles: Sequence[str], scripts: Sequence[str], data: str) -> str:
+    """A page of ``viewer/`` with styles, scripts and JSON data written into it."""
+    parts = {
+        "title": html.escape(title),
+        "style": "\n".join(_asset(name) for name in styles),
+        "script": "\n".join(_asset(name) for name in scripts),
+        "data": data.replace("<", "\\u003c"),
+    }
+    pieces = _asset(template).split("{{")
+    text = [pieces[0]]
+    for piece in pieces[1:]:  # once, left to right: what is written in is not searched again
+        name, rest = piece.split("}}", 1)
+        text += [parts[name], rest]
+    return "".join(text)
+
+
 def _asset(name: str) -> str:
     return resources.files("footwork").joinpath("doors", "viewer", name).read_text(encoding="utf-8")
 
@@ -187,15 +201,20 @@ def label(footage: Footage) -> str:
 
 def extent(footage: Footage, margin: float = 1.0) -> list[float]:
     """Centre x, y and half sizes (m) of what there is to see: path, start, goal, and a maze within its border."""
-    arena = footage.task.arena
-    points = [footage.qpos[:, :2].astype(np.float64), np.array([arena.start])]
+    points = [footage.qpos[:, :2].astype(np.float64)]
     if footage.has_goal:
         points.append(footage.goal[None].astype(np.float64))
+    return arena_extent(footage.task.arena, np.concatenate(points), margin)
+
+
+def arena_extent(arena: Arena, points: np.ndarray | None = None, margin: float = 1.0) -> list[float]:
+    """The same of an arena and points [P, 2] in m in it; without points its goals are seen too."""
+    every = [np.array([arena.start]), np.array(arena.goals) if points is None else points]
     if arena.grid:
         half = np.array([len(arena.grid[0]) - 2, len(arena.grid) - 2]) * arena.cell / 2
-        points.append(np.stack([-half, half]))
-    every = np.concatenate(points)
-    low, high = every.min(axis=0), every.max(axis=0)
+        every.append(np.stack([-half, half]))
+    together = np.concatenate(every)
+    low, high = together.min(axis=0), together.max(axis=0)
     return [*((low + high) / 2).tolist(), *((high - low) / 2 + margin).tolist()]
 
 
@@ -211,4 +230,4 @@ def _base64(array: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-__all__ = ["Replay", "film_row", "find_policies", "replay"]
+__all__ = ["Replay", "arena_extent", "film_row", "find_policies", "page", "replay"]

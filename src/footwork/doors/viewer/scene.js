@@ -1,48 +1,6 @@
-// Shows recorded episodes: forward kinematics of the ant, a small WebGL 2 renderer, and the controls. It fetches nothing.
+// The ant in 3-D, for the replay and for the live page: forward kinematics, a small WebGL 2 renderer, and a stage of
+// panels with a camera. It fetches nothing.
 "use strict";
-
-// ---------------------------------------------------------------- decoding
-
-const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-
-// One episode's numbers; frames are [T + 1, 15], each column quantised to 16 bits between its own bounds.
-function decode(episode) {
-  const packed = new Uint16Array(bytes(episode.frames).buffer);
-  const width = episode.low.length;
-  const frames = new Float32Array(packed.length);
-  for (let i = 0; i < packed.length; i++) frames[i] = episode.low[i % width] + episode.step[i % width] * packed[i];
-  return {
-    frames,
-    width,
-    steps: packed.length / width - 1,
-    choice: new Int8Array(bytes(episode.choice).buffer),
-    total: new Float32Array(bytes(episode.total).buffer),
-    distance: new Float32Array(bytes(episode.distance).buffer),
-    flags: bytes(episode.flags), // 1 fallen, 2 upside down
-    odds: bytes(episode.odds), // [decisions, 4], 255 is certain; empty where nobody chooses
-    value: new Float32Array(bytes(episode.value).buffer), // [decisions], empty where the critic is not at hand
-  };
-}
-
-// The pose at a time in control steps: linear, and the quaternion along the shorter arc.
-function poseAt(data, time) {
-  const at = Math.max(0, Math.min(time, data.steps));
-  const i = Math.min(Math.floor(at), Math.max(data.steps - 1, 0));
-  const u = at - i;
-  const a = i * data.width;
-  const b = Math.min(i + 1, data.steps) * data.width;
-  const f = data.frames;
-  let dot = 0;
-  for (let k = 3; k < 7; k++) dot += f[a + k] * f[b + k];
-  const q = [];
-  for (let k = 0; k < data.width; k++) {
-    const sign = k >= 3 && k < 7 && dot < 0 ? -1 : 1;
-    q.push(f[a + k] * (1 - u) + sign * f[b + k] * u);
-  }
-  const norm = Math.hypot(q[3], q[4], q[5], q[6]) || 1;
-  for (let k = 3; k < 7; k++) q[k] /= norm;
-  return q;
-}
 
 // ---------------------------------------------------------------- kinematics (3 x 3 matrices row by row, z up)
 
@@ -377,20 +335,27 @@ class Renderer {
     return { handle, places };
   }
 
-  mesh({ normals, offsets, tints, index }) {
-    const gl = this.gl, array = gl.createVertexArray();
-    gl.bindVertexArray(array);
+  mesh(data) {
+    const gl = this.gl, buffers = [0, 1, 2, 3].map(() => gl.createBuffer());
+    return this.refill({ array: gl.createVertexArray(), buffers }, data);
+  }
+
+  // Other vertices in a mesh that is there.
+  refill(mesh, { normals, offsets, tints, index }) {
+    const gl = this.gl;
+    gl.bindVertexArray(mesh.array);
     [normals, offsets, tints].forEach((numbers, i) => {
       if (!numbers) return;
-      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bindBuffer(gl.ARRAY_BUFFER, mesh.buffers[i]);
       gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(numbers), gl.STATIC_DRAW);
       gl.enableVertexAttribArray(i);
       gl.vertexAttribPointer(i, 3, gl.FLOAT, false, 0, 0);
     });
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.buffers[3]);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(index), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    return { array, count: index.length };
+    mesh.count = index.length;
+    return mesh;
   }
 
   set(values) {
@@ -453,13 +418,12 @@ class Renderer {
   }
 }
 
-// ---------------------------------------------------------------- what is on the page
+// ---------------------------------------------------------------- the stage
 
 const THEMES = {
   light: { back: "#f4f3ef", line: "#8d8a80", wall: "#b9bbc2", shin: "#4d525c", dark: 0 },
   dark: { back: "#17191d", line: "#7d828c", wall: "#4b505a", shin: "#a9aeb8", dark: 1 },
 };
-const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
 const FOV = 0.72; // rad, vertical
 const GOAL = "#D55E00";
 const ARROWS = ["→", "↑", "←", "↓"];
@@ -477,26 +441,31 @@ const element = (tag, className, parent, text) => {
 let fineness = 1; // less where pictures come slowly
 const pixels = () => Math.min(window.devicePixelRatio || 1, 2) * fineness;
 
-class Viewer {
-  constructor(footage) {
-    this.footage = footage;
-    this.colours = footage.colours.map(rgb);
-    this.flatColour = rgb(footage.flat_colour);
-    this.episodes = footage.episodes.map((episode) => ({ ...episode, data: decode(episode) }));
-    this.steps = Math.max(...this.episodes.map((episode) => episode.data.steps));
-    this.time = 0;
-    this.playing = false;
-    this.speed = 1;
+// Panels side by side on one canvas, and the camera they share. Whoever extends it fills `panels`: each has walls,
+// wall_height, start, goal, goal_radius, extent, and `element`, its section of the page.
+class Stage {
+  constructor({ skeleton, colours, flat_colour, directions }) {
+    this.skeleton = skeleton;
+    this.hex = colours;
+    this.colours = colours.map(rgb);
+    this.flatHex = flat_colour;
+    this.flatColour = rgb(flat_colour);
+    this.directions = directions;
+    this.panels = [];
     this.theme = window.matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
     this.view = { azimuth: -Math.PI / 2, elevation: 0.98, distance: 10.5, shift: [0, 0, 0] };
     this.canvas = document.getElementById("view");
     const lean = isLean(), gl = this.canvas.getContext("webgl2", { antialias: !lean, alpha: false });
     this.renderer = gl ? new Renderer(gl, lean) : null;
-    this.buildLegend();
-    this.episodes.forEach((episode) => this.buildPanel(episode));
-    this.buildTracks();
-    this.buildControls();
+    document.getElementById("camera").addEventListener("change", (event) => this.setCamera(event.target.value));
+    document.getElementById("theme").addEventListener("click", () => this.toggleTheme());
+    document.getElementById("help").addEventListener("click", () => document.getElementById("keys").showModal());
+    this.buildPointer();
     this.setTheme(this.theme);
+  }
+
+  // Called once the panels are there.
+  open() {
     this.setCamera("follow");
     new ResizeObserver(() => this.layout()).observe(document.getElementById("stage"));
     this.layout();
@@ -506,124 +475,70 @@ class Viewer {
     return choice < 0 ? this.flatColour : this.colours[choice];
   }
 
-  buildLegend() {
+  buildLegend(used) {
     const legend = document.getElementById("legend");
-    const used = new Set(this.episodes.flatMap((episode) => Array.from(episode.data.choice)));
-    this.footage.directions.forEach((name, i) => {
-      if (!used.has(i)) return;
+    const add = (colour, text) => {
       const entry = element("span", "", legend);
-      element("i", "", entry).style.background = this.footage.colours[i];
-      entry.append(`${ARROWS[i]} ${name}`);
-    });
-    if (used.has(-1)) {
-      const entry = element("span", "", legend);
-      element("i", "", entry).style.background = this.footage.flat_colour;
-      entry.append("flat policy");
-    }
+      element("i", "", entry).style.background = colour;
+      entry.append(text);
+    };
+    this.directions.forEach((name, i) => used.has(i) && add(this.hex[i], `${ARROWS[i]} ${name}`));
+    if (used.has(-1)) add(this.flatHex, "flat policy");
   }
 
-  buildPanel(episode) {
-    const panel = element("section", "panel", document.getElementById("stage"));
-    const card = element("div", "card", panel);
-    element("h2", "", card, episode.row);
-    element("small", "", card, episode.label);
-    const hud = { panel, chip: element("span", "chip", card) };
+  // The corner of a panel that tells of its ant: a chip, rows of figures, and bars of the master's odds.
+  buildCard(panel, title, label, rows, hasOdds) {
+    panel.element = element("section", "panel", document.getElementById("stage"));
+    const card = element("div", "card", panel.element), hud = { card };
+    hud.title = element("h2", "", card, title);
+    hud.label = element("small", "", card, label);
+    hud.chip = element("span", "chip", card);
     const list = element("dl", "", card);
-    const names = [["return", "return"], ["distance", episode.goal ? "to the goal" : "walked"]];
-    if (episode.data.value.length) names.push(["value", "value"]);
-    for (const [key, name] of names) {
+    for (const [key, name] of rows) {
       element("dt", "", list, name);
       hud[key] = element("dd", "", list, "");
     }
-    hud.spark = element("canvas", "spark", card);
-    if (episode.data.odds.length) {
-      const odds = element("div", "odds", card);
+    if (hasOdds) {
+      hud.oddsRow = element("div", "odds", card);
       hud.odds = ARROWS.map((arrow, i) => {
-        const column = element("span", "", odds);
-        const bar = element("b", "", element("i", "", column));
-        bar.style.background = this.footage.colours[i];
+        const column = element("span", "", hud.oddsRow), bar = element("b", "", element("i", "", column));
+        bar.style.background = this.hex[i];
         column.append(arrow);
         return bar;
       });
     }
-    hud.badge = element("div", "badge", panel);
-    episode.hud = hud;
-    if (this.renderer) episode.ribbon = this.renderer.mesh(ribbonMesh(episode.data, (c) => this.colourOf(c), 0.055));
+    hud.badge = element("div", "badge", panel.element);
+    return (panel.hud = hud);
   }
 
-  buildTracks() {
-    const tracks = document.getElementById("tracks");
-    const height = Math.max(5, Math.min(14, 48 / this.episodes.length));
-    for (const episode of this.episodes) {
-      const track = element("canvas", "track", tracks);
-      track.style.height = `${height}px`;
-      track.title = `${episode.row}, ${episode.label}`;
-      episode.track = track;
-    }
-    this.head = element("div", "", tracks);
-    this.head.id = "head";
-    tracks.setAttribute("aria-valuemax", this.steps);
-    const scrub = (event) => {
-      const box = tracks.getBoundingClientRect();
-      this.seek(((event.clientX - box.left) / box.width) * this.steps);
-    };
-    tracks.addEventListener("pointerdown", (event) => {
-      tracks.setPointerCapture(event.pointerId);
-      this.resume = this.playing;
-      this.setPlaying(false);
-      scrub(event);
-    });
-    tracks.addEventListener("pointermove", (event) => tracks.hasPointerCapture(event.pointerId) && scrub(event));
-    tracks.addEventListener("pointerup", () => this.resume && this.setPlaying(true));
+  showChoice(hud, choice) {
+    hud.chip.textContent = choice < 0 ? "flat policy" : `${ARROWS[choice]} ${this.directions[choice]}`;
+    hud.chip.style.background = choice < 0 ? this.flatHex : this.hex[choice];
   }
 
-  drawTracks() {
-    for (const episode of this.episodes) {
-      const { track, data } = episode;
-      track.width = track.clientWidth * pixels();
-      track.height = track.clientHeight * pixels();
-      const pen = track.getContext("2d"), scale = track.width / this.steps;
-      for (let i = 0; i < data.steps; i++) {
-        let end = i + 1;
-        while (end < data.steps && data.choice[end] === data.choice[i] && data.flags[end] === data.flags[i]) end++;
-        const choice = data.choice[i];
-        pen.fillStyle = choice < 0 ? this.footage.flat_colour : this.footage.colours[choice];
-        pen.fillRect(i * scale, 0, (end - i) * scale + 0.5, track.height);
-        if (data.flags[i] & 2) { // upside down: a dark line below
-          pen.fillStyle = "#000b";
-          pen.fillRect(i * scale, track.height * 0.6, (end - i) * scale + 0.5, track.height * 0.4);
-        }
-        i = end - 1;
-      }
-    }
-  }
-
-  buildControls() {
-    const on = (id, name, act) => document.getElementById(id).addEventListener(name, act);
-    const speeds = document.getElementById("speed");
-    SPEEDS.forEach((speed) => (element("option", "", speeds, `${speed} ×`).value = speed));
-    on("play", "click", () => this.toggle());
-    on("back", "click", () => this.nudge(-1));
-    on("forth", "click", () => this.nudge(1));
-    on("speed", "change", (event) => this.setSpeed(Number(event.target.value)));
-    on("camera", "change", (event) => this.setCamera(event.target.value));
-    on("theme", "click", () => this.setTheme(this.theme === "dark" ? "light" : "dark"));
-    on("help", "click", () => document.getElementById("keys").showModal());
-    this.setSpeed(1);
-    document.addEventListener("keydown", (event) => this.onKey(event));
-    this.buildPointer();
+  showBadge(hud, text, colour) {
+    hud.badge.classList.toggle("on", Boolean(text));
+    if (!text) return;
+    hud.badge.textContent = text;
+    hud.badge.style.background = colour;
   }
 
   buildPointer() {
     const canvas = this.canvas, fingers = new Map();
-    let spread = 0;
+    let spread = 0, down = null;
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
       fingers.set(event.pointerId, event);
       spread = 0;
+      down = event;
     });
-    const lift = (event) => fingers.delete(event.pointerId);
+    const lift = (event) => {
+      const still = down && Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) < 4;
+      if (still && event.button === 0 && fingers.size === 1) this.pick(event);
+      down = null;
+      fingers.delete(event.pointerId);
+    };
     canvas.addEventListener("pointerup", lift);
     canvas.addEventListener("pointercancel", lift);
     canvas.addEventListener("pointermove", (event) => {
@@ -647,6 +562,36 @@ class Viewer {
     }, { passive: false });
   }
 
+  // A click on the floor: whoever cares overrides onFloor(panel, [x, y]).
+  pick(event) {
+    const box = this.canvas.getBoundingClientRect(), x = event.clientX - box.left, y = event.clientY - box.top;
+    const panel = this.panels.find((p) => x >= p.box.x && x <= p.box.x + p.box.w && y >= p.box.y && y <= p.box.y + p.box.h);
+    if (!panel || !panel.lastPose) return;
+    const { eye, axes } = this.cameraOf(panel, panel.lastPose), half = Math.tan(FOV / 2), { box: b } = panel;
+    const u = (((x - b.x) / b.w) * 2 - 1) * half * (b.w / b.h), v = (1 - ((y - b.y) / b.h) * 2) * half;
+    const ray = plus(plus(times(axes.right, u), times(axes.top, v)), times(axes.back, -1));
+    if (ray[2] < -1e-3) this.onFloor(panel, plus(eye, times(ray, -eye[2] / ray[2])).slice(0, 2));
+  }
+
+  // Where a point of the floor is on the screen, [x, y] px from the canvas' corner: the other way round.
+  project(panel, [x, y]) {
+    const { eye, axes } = this.cameraOf(panel, panel.lastPose), half = Math.tan(FOV / 2), { box: b } = panel;
+    const d = minus([x, y, 0], eye), depth = -dot3(d, axes.back);
+    const u = dot3(d, axes.right) / depth / half / (b.w / b.h), v = dot3(d, axes.top) / depth / half;
+    return [b.x + ((u + 1) / 2) * b.w, b.y + ((1 - v) / 2) * b.h];
+  }
+
+  onFloor() {}
+
+  toggleTheme() {
+    this.setTheme(this.theme === "dark" ? "light" : "dark");
+  }
+
+  nextCamera() {
+    const cameras = ["follow", "whole", "above"];
+    this.setCamera(cameras[(cameras.indexOf(this.camera) + 1) % 3]);
+  }
+
   orbit(dx, dy) {
     this.view.azimuth -= dx * 0.006;
     this.view.elevation = Math.max(0.04, Math.min(Math.PI / 2 - 0.001, this.view.elevation + dy * 0.006));
@@ -665,47 +610,6 @@ class Viewer {
     this.dirty = true;
   }
 
-  onKey(event) {
-    if (event.target.tagName === "SELECT" || event.ctrlKey || event.metaKey || event.altKey) return;
-    const half = Math.round(0.5 / this.footage.control_dt);
-    const faster = (by) => this.setSpeed(SPEEDS[Math.max(0, Math.min(SPEEDS.length - 1, SPEEDS.indexOf(this.speed) + by))]);
-    const cameras = ["follow", "whole", "above"];
-    const actions = {
-      " ": () => this.toggle(),
-      ArrowLeft: () => this.nudge(-half),
-      ArrowRight: () => this.nudge(half),
-      ",": () => this.nudge(-1),
-      ".": () => this.nudge(1),
-      ArrowUp: () => faster(1),
-      ArrowDown: () => faster(-1),
-      Home: () => this.seek(0),
-      End: () => this.seek(this.steps),
-      f: () => this.setCamera(cameras[(cameras.indexOf(this.camera) + 1) % 3]),
-      l: () => this.setTheme(this.theme === "dark" ? "light" : "dark"),
-      "?": () => document.getElementById("keys").showModal(),
-    };
-    const act = actions[event.key] || actions[event.key.toLowerCase()];
-    if (!act) return;
-    event.preventDefault();
-    act();
-  }
-
-  toggle() {
-    if (!this.playing && this.time >= this.steps) this.time = 0;
-    this.setPlaying(!this.playing);
-  }
-
-  setPlaying(playing) {
-    this.playing = playing;
-    document.getElementById("play").textContent = playing ? "❚❚" : "▶";
-    this.dirty = true;
-  }
-
-  setSpeed(speed) {
-    this.speed = speed;
-    document.getElementById("speed").value = speed;
-  }
-
   setTheme(theme) {
     this.theme = theme;
     document.documentElement.classList.toggle("dark", theme === "dark");
@@ -721,19 +625,9 @@ class Viewer {
     this.dirty = true;
   }
 
-  nudge(steps) {
-    this.setPlaying(false);
-    this.seek(Math.round(this.time) + steps);
-  }
-
-  seek(time) {
-    this.time = Math.max(0, Math.min(this.steps, time));
-    this.dirty = true;
-  }
-
   // Panels in a grid: as many columns as make them nearest to 4 : 3.
   layout() {
-    const stage = document.getElementById("stage"), n = this.episodes.length, gap = 8;
+    const stage = document.getElementById("stage"), n = this.panels.length, gap = 8;
     const width = stage.clientWidth - 2 * gap, height = stage.clientHeight;
     let best = { error: Infinity };
     for (let columns = 1; columns <= n; columns++) {
@@ -742,28 +636,21 @@ class Viewer {
       if (error < best.error) best = { error, columns, rows };
     }
     const w = (width - gap * (best.columns - 1)) / best.columns, h = (height - gap * (best.rows - 1)) / best.rows;
-    this.episodes.forEach((episode, i) => {
+    this.panels.forEach((panel, i) => {
       const x = gap + (i % best.columns) * (w + gap), y = Math.floor(i / best.columns) * (h + gap);
-      episode.box = { x, y, w, h };
-      Object.assign(episode.hud.panel.style, { left: `${x}px`, top: `${y}px`, width: `${w}px`, height: `${h}px` });
+      panel.box = { x, y, w, h };
+      Object.assign(panel.element.style, { left: `${x}px`, top: `${y}px`, width: `${w}px`, height: `${h}px` });
     });
     this.canvas.width = stage.clientWidth * pixels();
     this.canvas.height = stage.clientHeight * pixels();
-    this.drawTracks();
     this.dirty = true;
   }
 
-  // Which choice, flags and sums hold at a time: those of the control step that led there.
-  index(episode) {
-    return Math.max(0, Math.min(episode.data.steps, Math.ceil(this.time - 1e-6)) - 1);
-  }
-
-  scene(episode, pose) {
-    const look = THEMES[this.theme], choice = episode.data.choice[this.index(episode)] ?? -1;
-    const tint = this.colourOf(choice), shin = rgb(look.shin);
+  scene(panel, pose, tint, ways) {
+    const look = THEMES[this.theme], shin = rgb(look.shin);
     const things = [];
-    geomPoses(this.footage.skeleton, pose).forEach(({ position, rotation }, i) => {
-      const geom = this.footage.skeleton.geoms[i];
+    geomPoses(this.skeleton, pose).forEach(({ position, rotation }, i) => {
+      const geom = this.skeleton.geoms[i];
       const part = geom.name.split("_")[0];
       const colour = part === "shin" ? shin : part === "thigh" ? mix(tint, shin, 0.25) : tint;
       things.push({
@@ -771,14 +658,14 @@ class Viewer {
         kind: 0, colour,
       });
     });
-    for (const [x, y, halfX, halfY] of episode.walls) {
-      const half = episode.wall_height / 2;
+    for (const [x, y, halfX, halfY] of panel.walls) {
+      const half = panel.wall_height / 2;
       things.push({
         mesh: this.renderer.box, model: matrix(IDENTITY, [x, y, half]), size: [halfX, halfY, half], radius: 0,
         kind: 1, colour: rgb(look.wall),
       });
     }
-    if (episode.goal) this.flag(things, episode.goal);
+    if (panel.goal) this.flag(things, panel.goal);
     const size = 400;
     things.push({
       mesh: this.floor ??= this.renderer.mesh({
@@ -787,11 +674,9 @@ class Viewer {
       }),
       model: matrix(IDENTITY, [pose[0], pose[1], 0]), size: [0, 0, 0], radius: 0, flat: true, kind: 2, colour: [1, 1, 1],
     });
-    things.push({
-      mesh: episode.ribbon, count: 6 * Math.min(Math.ceil(this.time), episode.data.steps),
-      model: matrix(IDENTITY, [0, 0, 0]), size: [0, 0, 0], radius: 0, flat: true, kind: 3, colour: [1, 1, 1],
-    });
-    return { things, ...this.cameraOf(episode, pose), uniforms: this.uniforms(episode, pose, look) };
+    const here = { model: matrix(IDENTITY, [0, 0, 0]), size: [0, 0, 0], radius: 0, flat: true, kind: 3, colour: [1, 1, 1] };
+    for (const way of ways) if (way.count) things.push({ ...here, ...way });
+    return { things, ...this.cameraOf(panel, pose), uniforms: this.uniforms(panel, pose, look) };
   }
 
   flag(things, [x, y]) {
@@ -800,25 +685,25 @@ class Viewer {
     things.push({ ...place, model: matrix(IDENTITY, [x, y, 2.5]), size: [0, 0, 0], radius: 0.17 });
   }
 
-  uniforms(episode, pose, look) {
-    const { eye, focus } = this.cameraOf(episode, pose);
+  uniforms(panel, pose, look) {
+    const { eye, focus } = this.cameraOf(panel, pose);
     const walls = new Float32Array(4 * MAX_WALLS);
-    episode.walls.slice(0, MAX_WALLS).forEach((wall, i) => walls.set(wall, 4 * i));
-    const goal = episode.goal ? [...episode.goal, episode.goal_radius, 1] : [0, 0, 0, 0];
+    panel.walls.slice(0, MAX_WALLS).forEach((wall, i) => walls.set(wall, 4 * i));
+    const goal = panel.goal ? [...panel.goal, panel.goal_radius, 1] : [0, 0, 0, 0];
     return {
       uEye: eye, uFocus: [pose[0], pose[1], 0.5], uBack: rgb(look.back), uLine: rgb(look.line), uDark: look.dark,
-      uGoal: goal, uStart: [...episode.start, 0, 1], uGoalColour: rgb(GOAL), uWalls: walls,
-      uNumWalls: Math.min(episode.walls.length, MAX_WALLS),
+      uGoal: goal, uStart: [...panel.start, 0, 1], uGoalColour: rgb(GOAL), uWalls: walls,
+      uNumWalls: Math.min(panel.walls.length, MAX_WALLS),
       uFog: Math.max(18, Math.hypot(...minus(eye, focus)) * (this.view.fit ? 1.6 : 1.1)),
     };
   }
 
-  cameraOf(episode, pose) {
-    const { box } = episode, aspect = box.w / box.h;
+  cameraOf(panel, pose) {
+    const { box } = panel, aspect = box.w / box.h;
     let { distance } = this.view;
     let target = [pose[0], pose[1], 0.4];
     if (this.view.fit) {
-      const [x, y, halfX, halfY] = episode.extent;
+      const [x, y, halfX, halfY] = panel.extent;
       target = [x, y, 0];
       const tall = this.camera === "above" ? halfY : halfY * 0.86 + 1;
       distance *= (1.04 * Math.max(tall, halfX / aspect)) / Math.tan(FOV / 2) / 10.5 + (this.camera === "above" ? 0.2 : 0);
@@ -826,86 +711,28 @@ class Viewer {
     target = plus(target, this.view.shift);
     const { azimuth, elevation } = this.view, flat = Math.cos(elevation);
     const eye = plus(target, times([Math.cos(azimuth) * flat, Math.sin(azimuth) * flat, Math.sin(elevation)], distance));
-    const up = [-Math.cos(azimuth) * Math.sin(elevation), -Math.sin(azimuth) * Math.sin(elevation), flat];
-    const view = multiply(perspective(FOV, aspect, 0.1, 900), lookAt(eye, target, up));
-    return { view, eye, focus: [pose[0], pose[1], 0.4] };
+    const top = [-Math.cos(azimuth) * Math.sin(elevation), -Math.sin(azimuth) * Math.sin(elevation), flat];
+    const back = unit(minus(eye, target)), axes = { right: cross(top, back), top, back };
+    const view = multiply(perspective(FOV, aspect, 0.1, 900), lookAt(eye, target, top));
+    return { view, eye, axes, focus: [pose[0], pose[1], 0.4] };
   }
 
-  draw() {
-    const scale = pixels();
+  wipe() {
     if (this.renderer) this.renderer.wipe(rgb(THEMES[this.theme].back), this.canvas.width, this.canvas.height);
-    for (const episode of this.episodes) {
-      const pose = poseAt(episode.data, this.time);
-      const { x, y, w, h } = episode.box;
-      if (this.renderer) {
-        const rectangle = [x, this.canvas.height / scale - y - h, w, h].map((v) => Math.round(v * scale));
-        this.renderer.render(this.scene(episode, pose), rectangle);
-      } else {
-        this.drawFlat(episode, pose, scale);
-      }
-      this.drawCard(episode);
-    }
-    this.head.style.left = `${(100 * this.time) / this.steps}%`;
-    const dt = this.footage.control_dt;
-    document.getElementById("clock").textContent =
-      `${(this.time * dt).toFixed(2)} s of ${(this.steps * dt).toFixed(2)} s · control step ${Math.round(this.time)}`;
-    document.getElementById("tracks").setAttribute("aria-valuenow", Math.round(this.time));
   }
 
-  drawCard(episode) {
-    const { hud, data, goal, start } = episode, i = this.index(episode), begun = this.time > 0;
-    const choice = data.choice[i] ?? -1;
-    hud.chip.textContent = choice < 0 ? "flat policy" : `${ARROWS[choice]} ${this.footage.directions[choice]}`;
-    hud.chip.style.background = choice < 0 ? this.footage.flat_colour : this.footage.colours[choice];
-    hud.return.textContent = (begun ? data.total[i] : 0).toFixed(1);
-    const place = poseAt(data, this.time);
-    const away = goal ? Math.hypot(place[0] - goal[0], place[1] - goal[1]) : Math.hypot(place[0] - start[0], place[1] - start[1]);
-    hud.distance.textContent = `${away.toFixed(2)} m`;
-    const decision = Math.floor(i / episode.option_steps);
-    if (hud.value) hud.value.textContent = data.value[decision].toFixed(1);
-    if (hud.odds) hud.odds.forEach((bar, k) => (bar.style.height = `${(100 * data.odds[4 * decision + k]) / 255}%`));
-    const over = this.time >= data.steps;
-    const [text, colour] = over ? [episode.outcome, episode.good ? "#009E73" : "#5c616b"]
-      : begun && data.flags[i] & 2 ? ["upside down", "#B3261E"]
-      : begun && data.flags[i] & 1 ? ["fallen", "#B3261E"] : ["", ""];
-    hud.badge.classList.toggle("on", Boolean(text));
-    if (text) {
-      hud.badge.textContent = text;
-      hud.badge.style.background = colour;
-    }
-    this.drawSpark(hud.spark, data, i);
-  }
-
-  // The return so far, and what is still to come.
-  drawSpark(spark, data, now) {
-    if (!spark.clientWidth) return;
-    spark.width = spark.clientWidth * pixels();
-    spark.height = spark.clientHeight * pixels();
-    const pen = spark.getContext("2d");
-    let low = 0, high = 0;
-    for (const total of data.total) {
-      low = Math.min(low, total);
-      high = Math.max(high, total);
-    }
-    const x = (i) => (i / Math.max(this.steps - 1, 1)) * (spark.width - 4) + 2;
-    const y = (v) => spark.height - 3 - ((v - low) / (high - low || 1)) * (spark.height - 6);
-    const ink = getComputedStyle(document.body).color;
-    for (const [from, to, alpha] of [[0, data.steps - 1, 0.22], [0, now, 1]]) {
-      pen.globalAlpha = alpha;
-      pen.strokeStyle = pen.fillStyle = ink;
-      pen.lineWidth = 1.4 * pixels();
-      pen.beginPath();
-      for (let i = from; i <= to; i += Math.max(1, Math.floor(data.steps / 400))) pen.lineTo(x(i), y(data.total[i]));
-      pen.stroke();
-    }
-    pen.beginPath();
-    pen.arc(x(now), y(data.total[now] ?? 0), 2.2 * pixels(), 0, 7);
-    pen.fill();
+  // One panel: the ant in its colour, and the ways walked, [{ mesh, count }] (without WebGL: `pieces`, from above).
+  drawPanel(panel, pose, tint, ways, pieces) {
+    const scale = pixels(), { x, y, w, h } = panel.box;
+    panel.lastPose = pose;
+    if (!this.renderer) return this.drawFlat(panel, pose, tint, pieces(), scale);
+    const rectangle = [x, this.canvas.height / scale - y - h, w, h].map((v) => Math.round(v * scale));
+    return this.renderer.render(this.scene(panel, pose, tint, ways), rectangle);
   }
 
   // Without WebGL: the same from above, with the pen of the page.
-  drawFlat(episode, pose, scale) {
-    const pen = this.pen ??= this.canvas.getContext("2d"), look = THEMES[this.theme], { x, y, w, h } = episode.box;
+  drawFlat(panel, pose, tint, pieces, scale) {
+    const pen = this.pen ??= this.canvas.getContext("2d"), look = THEMES[this.theme], { x, y, w, h } = panel.box;
     pen.save();
     pen.setTransform(scale, 0, 0, scale, 0, 0);
     pen.beginPath();
@@ -913,20 +740,19 @@ class Viewer {
     pen.clip();
     pen.fillStyle = look.back;
     pen.fillRect(x, y, w, h);
-    const [cx, cy, halfX, halfY] = this.view.fit ? episode.extent : [pose[0], pose[1], 0.42 * this.view.distance, 0.42 * this.view.distance];
+    const [cx, cy, halfX, halfY] = this.view.fit ? panel.extent : [pose[0], pose[1], 0.42 * this.view.distance, 0.42 * this.view.distance];
     const zoom = Math.min(w / halfX, h / halfY) / 2.1;
     pen.translate(x + w / 2, y + h / 2);
     pen.scale(zoom, -zoom);
     pen.translate(-cx - this.view.shift[0], -cy - this.view.shift[1]);
     pen.fillStyle = look.wall;
-    for (const [wx, wy, hx, hy] of episode.walls) pen.fillRect(wx - hx, wy - hy, 2 * hx, 2 * hy);
-    if (episode.goal) {
+    for (const [wx, wy, hx, hy] of panel.walls) pen.fillRect(wx - hx, wy - hy, 2 * hx, 2 * hy);
+    if (panel.goal) {
       pen.fillStyle = GOAL;
       pen.beginPath();
-      pen.arc(...episode.goal, episode.goal_radius, 0, 7);
+      pen.arc(...panel.goal, panel.goal_radius, 0, 7);
       pen.fill();
     }
-    const { data } = episode, until = Math.min(Math.ceil(this.time), data.steps);
     const line = (ax, ay, bx, by, width, colour) => {
       pen.lineWidth = width;
       pen.lineCap = "round";
@@ -936,11 +762,9 @@ class Viewer {
       pen.lineTo(bx, by);
       pen.stroke();
     };
-    const at = (i, k) => data.frames[i * data.width + k];
-    for (let i = 0; i < until; i++) line(at(i, 0), at(i, 1), at(i + 1, 0), at(i + 1, 1), 0.1, this.colourOf(data.choice[i]));
-    const tint = this.colourOf(data.choice[this.index(episode)] ?? -1);
-    geomPoses(this.footage.skeleton, pose).forEach(({ position, rotation }, i) => {
-      const geom = this.footage.skeleton.geoms[i], along = times([rotation[2], rotation[5], rotation[8]], geom.half);
+    for (const [ax, ay, bx, by, colour] of pieces) line(ax, ay, bx, by, 0.1, colour);
+    geomPoses(this.skeleton, pose).forEach(({ position, rotation }, i) => {
+      const geom = this.skeleton.geoms[i], along = times([rotation[2], rotation[5], rotation[8]], geom.half);
       const colour = geom.name.startsWith("shin") ? rgb(look.shin) : tint;
       const [a, b] = [minus(position, along), plus(position, along)];
       line(a[0], a[1], b[0], b[1], 2 * geom.radius, colour);
@@ -956,28 +780,4 @@ class Viewer {
     fineness = Math.max(0.5, fineness * 0.7);
     this.layout();
   }
-
-  frame(now) {
-    const elapsed = Math.min((now - (this.last ?? now)) / 1000, 0.25);
-    this.last = now;
-    if (this.playing) {
-      this.time = Math.min(this.steps, this.time + (elapsed * this.speed) / this.footage.control_dt);
-      if (this.time >= this.steps) this.setPlaying(false);
-    }
-    if (this.playing || this.dirty) {
-      this.dirty = false;
-      this.draw();
-      if (this.playing) this.spare(elapsed);
-    }
-    requestAnimationFrame((next) => this.frame(next));
-  }
-}
-
-if (typeof document === "undefined") {
-  module.exports = { decode, poseAt, geomPoses }; // to be tested without a browser
-} else {
-  const viewer = new Viewer(JSON.parse(document.getElementById("footage").textContent));
-  window.footwork = viewer;
-  requestAnimationFrame((now) => viewer.frame(now));
-  if (!window.matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.setPlaying(true);
 }

@@ -205,7 +205,9 @@ def test_the_update_is_charged_for_the_products_that_xla_counts():
     one = lambda tree: jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), tree)  # noqa: E731
 
     def gradient(params, batch, mask):
-        return jax.grad(lambda p: ppo.loss(policy, config, p, batch, mask, jnp.float32(1.0))[0])(params)
+        return jax.grad(lambda p: ppo.loss(policy, config, p, batch, mask, jnp.float32(1.0), jnp.float32(0.0))[0])(
+            params
+        )
 
     samples, valid, _ = jax.eval_shape(
         lambda params, transition: ppo.digest(policy, config, params, transition), one(learners.params), one(rollout)

@@ -51,7 +51,7 @@ def test_a_filmed_master_is_the_evaluated_one_bit_for_bit():
 
 
 def test_rewards_of_control_steps_add_up_to_the_masters(monkeypatch):
-    monkeypatch.setattr(evaluating, "BatchPhysics", Glider)
+    monkeypatch.setattr(evaluating, "physics_for", lambda engine, *rest: Glider(*rest))
     task = replace(ANT_BANDIT, arena=Arena("ahead", (0.0, 0.0), ((0.0, 3.0),)), episode_steps=200)
     experiment = replace(MASTER, task=replace(task, weights=PENALISED_WEIGHTS))
     trained = Trained(experiment, (0,), constant(experiment.policy(), [[[0.0, 5.0, 0.0, 0.0]]]), "")
@@ -90,7 +90,7 @@ def test_a_packaged_actor_has_no_value():
 
 @pytest.mark.parametrize("event", ["flipped", "fallen"])
 def test_how_an_episode_ended(monkeypatch, event):
-    monkeypatch.setattr(evaluating, "BatchPhysics", Glider)
+    monkeypatch.setattr(evaluating, "physics_for", lambda engine, *rest: Glider(*rest))
     rule = {"flipped": "flip", "fallen": "height"}[event]
     flat = Experiment("test/flat", replace(ANT_BANDIT, fall_rule=rule, episode_steps=5), CONFIG, 1)
     outputs = np.zeros((1, 1, 8))

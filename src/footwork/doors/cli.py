@@ -483,6 +483,7 @@ def _video(command: Video, rest: list[str]) -> int:
     say: Callable[[str], None] = lambda line: print(f"footwork: {line}", file=sys.stderr)  # noqa: E731
     path = video(filmed.footage, command.to.suffix, look, say).save(command.to)
     print(f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB")
+    return 0
 
 
 def _export(command: Export, rest: list[str]) -> int:
@@ -491,7 +492,6 @@ def _export(command: Export, rest: list[str]) -> int:
     _at_least_one("episodes", command.episodes)
     card = export(command.row, command.to, command.runs, command.episodes, command.seed, command.threads, command.onnx)
     print(f"{command.row}: exported; the model card is {card}")
-
     return 0
 
 

@@ -112,9 +112,11 @@ def test_an_export_does_not_write_over_anything(exported):
         export("maze/hrl/plain", exported, NOWHERE, 1)
 
 
-def test_exported_sub_policies_carry_a_master(exported, tmp_path):
+def test_exported_sub_policies_carry_a_master(exported, tmp_path, monkeypatch):
     gymnasium = pytest.importorskip("gymnasium", reason="needs the extra footwork[gym]")
     to = tmp_path / "walkers"
+    measured = json.loads((exported / "evaluation.json").read_text(encoding="utf-8"))  # of another: nobody reads it
+    monkeypatch.setattr("footwork.doors.export.evaluate", lambda *args, **fields: measured)
     export("walker/plain", to, NOWHERE, 4)
     folder = gymnasium.make("footwork/AntMazeOptions-v0", sub_policies=str(to), option_steps=2).unwrapped
     packaged = gymnasium.make("footwork/AntMazeOptions-v0", sub_policies="walker/plain", option_steps=2).unwrapped

@@ -9,7 +9,7 @@ that fill a block up are held, and cost nothing).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -61,6 +61,24 @@ def _pure(task: Task, direction: int | None, num_rows: int) -> Env:
     return Env(task, _NoEngine(num_rows), goal_index)  # type: ignore[arg-type]
 
 
+class _Master(Options):
+    """Options that are equal where what is compiled of them is, whatever engine stands below: compiled once for all."""
+
+    @cached_property
+    def _compiled(self) -> tuple[Any, ...]:
+        return self.inner.task, self.num_envs, self.sub_policies, self.option_steps
+
+    @cached_property
+    def _hash(self) -> int:  # asked for twice per control step, and a task is large
+        return hash(self._compiled)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Master) and self._compiled == other._compiled
+
+    def __hash__(self) -> int:
+        return self._hash
+
+
 class Rows:
     """N episodes side by side. Nothing begins by itself: :meth:`restart` does it, also the first time.
 
@@ -81,7 +99,7 @@ class Rows:
         self._pure: Environment = pure
         self._env: Environment = replace(pure, physics=physics)
         if setting.sub_policies is not None:
-            self._pure = Options(pure, setting.sub_policies, setting.option_steps)
+            self._pure = _Master(pure, setting.sub_policies, setting.option_steps)
             self._env = replace(self._pure, inner=self._env)
         self._state: Any = _nothing_begun(self._pure, physics.initial())
         self._keys = np.zeros((num_rows, 2), np.uint32)  # of each row's episode

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,9 +15,11 @@ from footwork.doors.policies import find_policies
 from footwork.options import SubPolicies
 from footwork.robot import JOINT_NAMES, ROBOTS, Robot
 from footwork.study.experiments import ANT_BANDIT, ANT_MAZE, ANT_WALKER, find_row, read_maze
+from footwork.study.runs import packaged
 from footwork.tasks.observe import JOINT_SPEED_SCALE, OBS_CLIP, VELOCITY_SCALE
 from footwork.tasks.task import FallRule, Task
 from footwork.tasks.terms import FREE_WEIGHTS, PENALISED_WEIGHTS, RewardWeights
+from footwork.train import Experiment
 from footwork.types import NUM_FEET
 
 Potential = Literal["straight", "geodesic"]
@@ -218,18 +221,32 @@ def ant_maze_options(
     setting = ant_maze(potential=potential, goal_reward=goal_reward, xy_scale=xy_scale, **maze_fields)
     if not isinstance(sub_policies, SubPolicies):
         sub_policies = _load(sub_policies, setting.task.robot)
-    sub_policies = replace(sub_policies, deterministic=deterministic_sub_policies)
+    sub_policies = _acting(sub_policies, deterministic_sub_policies)
     return replace(setting, sub_policies=sub_policies, option_steps=option_steps)
 
 
-def _load(address: str, robot: Robot) -> SubPolicies:
+@lru_cache(maxsize=64)  # the same object for the same policies: what is compiled for them is shared
+def _acting(sub_policies: SubPolicies, deterministic: bool) -> SubPolicies:
+    return replace(sub_policies, deterministic=deterministic)
+
+
+@lru_cache(maxsize=64)
+def _packaged(address: str) -> tuple[Experiment, SubPolicies | None]:
+    return _found(address)
+
+
+def _found(address: str) -> tuple[Experiment, SubPolicies | None]:
     trained = find_policies(address)
-    experiment = trained.experiment
-    if not experiment.is_walker:
+    return trained.experiment, trained.sub_policies() if trained.experiment.is_walker else None
+
+
+def _load(address: str, robot: Robot) -> SubPolicies:
+    experiment, sub_policies = (_packaged if packaged(address).is_file() else _found)(address)
+    if sub_policies is None:
         raise ValueError(f"sub_policies must walk in four directions (walker/...), got {experiment.name}")
     if experiment.task.robot != robot:
         raise ValueError(f"the environment has ant {robot.name!r}, {address} is for {experiment.task.robot.name!r}")
-    return trained.sub_policies()
+    return sub_policies
 
 
 def _robot(name: str) -> Robot:

@@ -31,7 +31,7 @@ from footwork.study.experiments import ANT_MAZE, ANT_WALKER
 from footwork.study.palette import DIRECTION_COLOURS, rgb
 from webdriver import AVAILABLE, MISSING, Browser
 
-VIEWER = Path(footwork.doors.__file__).parent / "viewer" / "viewer.js"
+VIEWER = Path(footwork.doors.__file__).parent / "viewer"
 NODE = shutil.which("node")
 needs_node = pytest.mark.skipif(NODE is None, reason="needs node, to run the page's kinematics")
 
@@ -73,7 +73,8 @@ def shot(steps=60, task=ANT_MAZE, row="maze/hrl/test", seed=0, outcome="reached"
 
 def node(code, data):
     """What the page's own code makes of ``data``."""
-    script = f"const v = require({json.dumps(str(VIEWER))}), a = JSON.parse(require('fs').readFileSync(0)); {code}"
+    script = "".join((VIEWER / name).read_text() for name in ("scene.js", "replay.js"))
+    script += f"const v = module.exports, a = JSON.parse(require('fs').readFileSync(0)); {code}"
     done = subprocess.run([NODE, "-e", script], input=json.dumps(data), capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
 

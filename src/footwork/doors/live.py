@@ -38,6 +38,9 @@ from footwork.train import (
 from footwork.types import Array, Key, Params
 
 REACH = 0.5  # m from the goal that count as there
+LEAVE = 1.5  # m from the goal that count as gone again
+STAY_SECONDS = 1.2  # at the goal, before a led ant begins anew
+LIE_SECONDS = 4.0  # upside down, before any ant does
 PUSH = 3.0  # m/s that a push adds
 _LOOK_AHEAD = 1.2  # m
 _FOR_EVER = 1_000_000_000
@@ -103,6 +106,7 @@ class Ant:
         self.odds: np.ndarray | None = None  # of the last decision, [4], where a master made it
         self.value: float | None = None
         self.fallen = self.flipped = self.arrived = False
+        self.lying = self.staying = 0  # control steps, upside down and at the goal
         self.distance = np.inf
         self.state: OptionsState
         self.state, self.obs = self.env.initial(jax.random.fold_in(self.key, 0))
@@ -148,26 +152,38 @@ class Ant:
         """Falls, flips and arrivals are counted as they begin."""
         events = {name: np.asarray(value)[0] for name, value in self.state.total.events.items()}
         self.distance = float(events["goal_distance"])
-        fallen, flipped, arrived = bool(events["fallen"]), bool(events["flipped"]), self.distance <= REACH
+        fallen, flipped = bool(events["fallen"]), bool(events["flipped"])
+        arrived = self.distance <= (LEAVE if self.arrived else REACH)
         self.falls += fallen and not self.fallen
         self.flips += flipped and not self.flipped
         self.goals += arrived and not self.arrived
+        self.lying = self.lying + 1 if flipped else 0
+        self.staying = self.staying + 1 if arrived else 0
         self.fallen, self.flipped, self.arrived = fallen, flipped, arrived
         if bool(np.asarray(self.state.inner.held)[0]):  # the simulation failed
             self.restart()
+
+    def begin_again(self, led: bool) -> bool:
+        """Restart what has arrived (where it is ``led``) or lies on its back, after a while; tells whether it did."""
+        dt = self.task.robot.control_dt
+        if self.lying * dt < LIE_SECONDS and (not led or self.staying * dt < STAY_SECONDS):
+            return False
+        self.restart()
+        return True
 
     def restart(self) -> None:
         """Begin anew above the start; a goal that was moved stays."""
         goal = self.state.inner.goal
         self.state, self.obs = _restart(self.env, self.state, jax.random.fold_in(self.key, 2 * self.steps + 2))
         self.move_goal(np.asarray(goal)[0])
-        self.within, self.fallen, self.flipped = 0, False, False
+        self.within = self.lying = self.staying = 0
+        self.fallen = self.flipped = False
 
     def move_goal(self, goal: np.ndarray) -> None:
         """Put the goal at [2] in m."""
         inner = self.state.inner
         self.state = self.state._replace(inner=inner._replace(goal=jnp.asarray(goal, jnp.float32)[None]))
-        self.arrived = bool(np.hypot(*(np.asarray(goal) - self.qpos[:2])) <= REACH)
+        self.arrived, self.staying = False, 0
 
     def push(self, angle: float) -> None:
         """A sudden push: :data:`PUSH` m/s more in a direction (rad), and a third of that upwards."""

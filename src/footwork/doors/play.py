@@ -91,6 +91,7 @@ class Visit:
         self.pace, self.paused = 1.0, False
         self.lesson: Lesson | None = None
         self.lesson_arena: Arena | None = None
+        self.lesson_leads = False  # once it can
         self.ants: list[Ant] = []
         self.masters: list[Master | None] = []
         self._planner: tuple[tuple[float, float], Planner] | None = None
@@ -105,13 +106,13 @@ class Visit:
         """Choose who leads."""
         if who not in self.leaders():
             raise ValueError(f"nobody of that name can lead here: {who!r}; there are {', '.join(self.leaders())}")
-        self.who = who
+        self.who, self.lesson_leads = who, False
 
     def do_steer(self, direction: int) -> None:
         """Be the master."""
         if direction not in range(len(DIRECTIONS)):
             raise ValueError(f"direction must be 0..3, got {direction!r}")
-        self.who, self.held = "you", int(direction)
+        self.who, self.held, self.lesson_leads = "you", int(direction), False
 
     def do_goal(self, at: Any) -> None:
         """Move the goal."""
@@ -189,6 +190,7 @@ class Visit:
         row = self.master_row()
         experiment = replace(row, task=replace(row.task, arena=arena), total_steps=self.house.lesson_steps)
         self.lesson, self.lesson_arena = Lesson(experiment, self.find_sub_policies(self.rows[0])), self.arena
+        self.lesson_leads, self._reported = True, 0.0
         self.tell({"is": "lesson", "fresh": True, **self.lesson.report()})
 
     def do_stop(self) -> None:
@@ -298,12 +300,15 @@ class Visit:
         """Let ``seconds`` go by; when the machine cannot keep up, the ant is slower, not the page."""
         dt = self.ants[0].task.robot.control_dt
         self._behind = min(self._behind + (0.0 if self.paused else seconds * self.pace), 3 * self.pace / 30)
+        if self.lesson_leads and "lesson" in self.leaders():
+            self.who, self.lesson_leads = "lesson", False
         steps = 0
         leaders = self.current_leaders()
         while self._behind >= dt:
             self._behind -= dt
             for ant, leader in zip(self.ants, leaders, strict=True):
                 ant.step(leader)
+                ant.begin_again(led=not isinstance(leader, int))
             steps += len(self.ants)
         now = time.monotonic()
         self._recent = [(at, n) for at, n in self._recent if at > now - 2.0] + [(now, steps)]
@@ -521,10 +526,10 @@ def play(row: str, runs: Path, host: str, port: int, seats: int, lesson_steps: i
         raise ValueError(f"play shows masters (maze/hrl/..., bandit/hrl/...), not {trained.experiment.name}")
     house = House(runs, row, seats, lesson_steps)
     server = open_server(house, host, port)
-    address = server.socket.getsockname()
-    print(f"http://{address[0]}:{address[1]}/   (Ctrl-C ends it)", flush=True)
     old = [(number, signal.signal(number, signal.default_int_handler)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
+        address = server.socket.getsockname()
+        print(f"http://{address[0]}:{address[1]}/   (Ctrl-C ends it)", flush=True)
         server.serve_forever()
     except KeyboardInterrupt:
         print("closing")

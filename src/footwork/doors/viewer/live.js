@@ -27,7 +27,8 @@ class Live extends Stage {
     const fill = (id, entries) => entries.forEach(([value, text]) => (element("option", "", byId(id), text).value = value));
     fill("first", this.world.sub_policies.map((row) => [row, row.replace("walker/", "")]));
     fill("second", [["", "no others beside them"], ...this.world.sub_policies.map((row) => [row, `beside them: ${row.replace("walker/", "")}`])]);
-    fill("arena", this.world.arenas.map((name) => [name, name]));
+    fill("arena", [...this.world.arenas.map((name) => [name, name]), ["drawn", "my own"]]);
+    byId("arena").lastChild.hidden = byId("arena").lastChild.disabled = true; // shown, not to be chosen
     fill("pace", PACES.map((pace) => [pace, `${pace} ×`]));
     byId("pace").value = 1;
     const rows = () => this.send({ do: "sub_policies", rows: [byId("first").value, byId("second").value].filter(Boolean) });
@@ -139,8 +140,7 @@ class Live extends Stage {
     this.say("");
     byId("first").value = scene.ants[0];
     byId("second").value = scene.ants[1] ?? "";
-    if (this.world.arenas.includes(scene.name)) byId("arena").value = scene.name;
-    else byId("arena").selectedIndex = -1;
+    byId("arena").value = scene.name;
     if (!this.map.drawing || scene.drawn) {
       this.setDrawing(false);
       this.map.show(scene);
@@ -182,7 +182,7 @@ class Live extends Stage {
     byId("done").value = of;
     byId("success").textContent = lesson.success === null ? "–" : `${Math.round(100 * lesson.success)} %`;
     byId("progress").textContent = lesson.progress === null ? "–" : `${lesson.progress.toFixed(1)} m`;
-    byId("learned").textContent = `${lesson.step.toLocaleString("en")} of ${lesson.total.toLocaleString("en")}`;
+    byId("learned").textContent = `${Math.round(lesson.step / 1000)} k of ${Math.round(lesson.total / 1000)} k`;
     byId("rate").textContent = lesson.rate.toLocaleString("en");
     if (lesson.success !== null) this.curve.push([of, lesson.success]);
     this.drawCurve();
@@ -214,16 +214,20 @@ class Live extends Stage {
 
   frame(now) {
     const elapsed = (now - (this.last ?? now)) / 1000;
-    if (this.dirty && this.panels.length && this.panels.every((panel) => panel.ant)) {
+    if (this.dirty) {
       this.dirty = false;
       this.last = now;
-      this.wipe();
-      this.panels.forEach((panel) => this.drawAnt(panel));
-      this.map.draw();
-      this.frames++;
       this.spare(elapsed);
+      this.draw();
+      this.frames++;
     }
     requestAnimationFrame((next) => this.frame(next));
+  }
+
+  draw() {
+    this.wipe();
+    this.panels.filter((panel) => panel.ant).forEach((panel) => this.drawAnt(panel));
+    this.map?.draw();
   }
 
   drawAnt(panel) {

@@ -72,8 +72,8 @@ class Viewer extends Stage {
   }
 
   layout() {
-    super.layout();
     this.drawTracks();
+    super.layout();
   }
 
   buildTracks() {
@@ -266,8 +266,8 @@ class Viewer extends Stage {
     }
     if (this.playing || this.dirty) {
       this.dirty = false;
-      this.draw();
       if (this.playing) this.spare(elapsed);
+      this.draw();
     }
     requestAnimationFrame((next) => this.frame(next));
   }

@@ -583,6 +583,8 @@ class Stage {
 
   onFloor() {}
 
+  draw() {}
+
   toggleTheme() {
     this.setTheme(this.theme === "dark" ? "light" : "dark");
   }
@@ -643,7 +645,7 @@ class Stage {
     });
     this.canvas.width = stage.clientWidth * pixels();
     this.canvas.height = stage.clientHeight * pixels();
-    this.dirty = true;
+    this.draw(); // at once: the canvas is empty now
   }
 
   scene(panel, pose, tint, ways) {

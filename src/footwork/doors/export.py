@@ -96,7 +96,8 @@ def _card(
     """The model card."""
     experiment, versions = trained.experiment, meta["versions"]
     kind = "A master" if experiment.is_master else "Sub-policies" if experiment.is_walker else "A flat policy"
-    seeds = " ".join(map(str, meta.get("batch", trained.seeds)))
+    batch = list(meta.get("batch", trained.seeds))
+    seeds = " ".join(map(str, batch))
     arena, robot = experiment.task.arena.name, experiment.task.robot.name
     stands = (
         ""
@@ -119,7 +120,9 @@ def _card(
         "",
         "## How it was trained",
         "",
-        f"`footwork train {experiment.name} --seeds {seeds}`, {meta['steps']:,} control steps per run, with "
+        f"`footwork train {experiment.name} --seeds {seeds}`, {meta['steps']:,} control steps per run"
+        + ("" if batch == list(trained.seeds) else f"; this is seed {', '.join(map(str, trained.seeds))}")
+        + ", with "
         + ", ".join(f"{name} {versions[name]}" for name in ("footwork", "jax", "mujoco"))
         + ". `config.json` holds every field, those changed on the command line too.",
         "",
@@ -169,7 +172,8 @@ def _figures(report: dict[str, Any], seed: int) -> list[str]:
     if report["time_to_goal_s"] is not None:
         rows.append(("time to the goal", f"{report['time_to_goal_s']:.1f} s"))
     seeds = ", ".join(map(str, report["seeds"]))
-    said = f"{report['episodes']} episodes (seeds {seeds}; episodes from seed {seed}), sampled actions, 95 % intervals:"
+    said = f"{report['episodes']} episodes (policy of seed {seeds}; episodes from seed {seed}), sampled actions, 95 %"
+    said += " intervals over episodes:"
     return [said, "", "| | |", "|---|---|", *(f"| {what} | {figure} |" for what, figure in rows)]
 
 

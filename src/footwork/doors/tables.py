@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from footwork.arena import DIRECTIONS
@@ -168,13 +169,13 @@ def bench_tables(report: dict[str, Any]) -> list[Table]:
 
 
 def _contestants_table(contestants: dict[str, Any], note: str) -> Table:
-    table = Table(title=f"control steps per second, median [least, largest]\n{note}", title_justify="left")
+    table = Table(title=f"control steps per second, median (least, largest)\n{note}", title_justify="left")
     table.add_column("contestant", no_wrap=True)
     for name in ("steps/s", "decisions/s", "over its physics", "to first update s", "compiling s", "peak MB"):
         table.add_column(name, justify="right")
     for name, record in contestants.items():
         if "skipped" in record:
-            table.add_row(name, f"skipped: {record['skipped']}")
+            table.add_row(name, escape(f"skipped: {record['skipped']}"))
             continue
         rates = (_spread(record.get(key), form) for key, form in CONTESTANT_FIGURES)
         table.add_row(name, *rates, *(_number(record.get(key)) for key in ("start_s", "compile_s", "peak_mb")))
@@ -186,7 +187,7 @@ CONTESTANT_FIGURES = (("steps_per_second", ",.0f"), ("decisions_per_second", ",.
 
 def _targets_table(report: dict[str, Any]) -> Table:
     table = Table(title="ratios, within each round", title_justify="left")
-    for name in ("figure", "median [least, largest]", "asked for", "reached"):
+    for name in ("figure", "median (least, largest)", "asked for", "reached"):
         table.add_column(name, justify="left" if name == "figure" else "right", no_wrap=True)
     figures = {**{key: report[key] for key in report["targets"]}, "compile_s": report["compile_s"]}
     for key in {**figures, "peak_mb": 0, **report["ratios"]}:
@@ -204,7 +205,7 @@ def _growth_table(axis: str, points: list[dict[str, Any]]) -> Table:
         table.add_column(name, justify="right")
     for point in points:
         if "skipped" in point:
-            table.add_row(str(point["size"]), f"skipped: {point['skipped']}")
+            table.add_row(str(point["size"]), escape(f"skipped: {point['skipped']}"))
             continue
         rates = (_spread(point["steps_per_second"], ",.0f"), _spread(point["over_reference"], ".2f"))
         table.add_row(
@@ -216,7 +217,7 @@ def _growth_table(axis: str, points: list[dict[str, Any]]) -> Table:
 def _spread(figures: dict[str, Any] | None, form: str) -> str:
     if figures is None:
         return ""
-    return f"{figures['median']:{form}} [{figures['low']:{form}}, {figures['high']:{form}}]"
+    return f"{figures['median']:{form}} ({figures['low']:{form}}, {figures['high']:{form}})"
 
 
 def _number(value: float | None, form: str = ",.1f") -> str:

@@ -50,6 +50,8 @@ TARGETS = (
     ("time_to_bandit_s", "<=", 20.0),
 )
 
+BUSY = 0.3  # load per core above which a machine has something else to do
+
 Say = Callable[[str], None]
 
 
@@ -73,6 +75,7 @@ class Bench:
     single: dict[str, float] = field(default_factory=dict)  # measured once: key of the report to number
     complete: bool = False
     begun: float = field(default_factory=time.monotonic)
+    load: float = field(default_factory=lambda: os.getloadavg()[0])  # of the machine, before this
 
     @property
     def rounds(self) -> int:
@@ -81,6 +84,8 @@ class Bench:
 
     def run(self) -> None:
         """Measure everything; a KeyboardInterrupt ends it early, and what is known stays known."""
+        if self.load > BUSY * len(usable_cores()):
+            self.say(f"this machine is busy (load {self.load:.1f}): times will be too long, and ratios less sure")
         try:
             with tempfile.TemporaryDirectory(prefix="footwork-bench-") as cache:
                 for stage in (self._measure_start, self._compete, self._grow, self._learn):
@@ -193,7 +198,7 @@ class Bench:
             "quick": self.quick,
             "rounds": self.rounds,
             "seconds": time.monotonic() - self.begun,
-            "machine": machine(),
+            "machine": {**machine(), "load": round(self.load, 2)},
             "versions": versions(),
             "ratios": ratios,
             "targets": {
@@ -291,7 +296,6 @@ def machine() -> dict[str, Any]:
         "processor": _processor(),
         "cores": len(usable_cores()),
         "memory_gb": round(memory, 1),
-        "load": round(os.getloadavg()[0], 2),
         "system": f"{platform.system()} {platform.machine()}",
     }
 

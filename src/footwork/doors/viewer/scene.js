@@ -180,7 +180,9 @@ float glass() {
   vec3 ray = uFocus - uEye;
   float t = dot(vPlace - uEye, ray) / dot(ray, ray);
   float keep = smoothstep(0.9, 2.6, distance(vPlace, uEye + clamp(t, 0.0, 1.0) * ray));
-  return mix(0.14, 1.0, max(keep, smoothstep(0.97, 1.0, t)));
+  vec2 here = vPlace.xy - uFocus.xy, side = -ray.xy / max(length(ray.xy), 1e-3);
+  keep = max(keep, 1.0 - smoothstep(0.0, 0.5, dot(here, side))); // what stands behind the ant hides nothing
+  return mix(0.14, 1.0, keep);
 }
 
 void main() {

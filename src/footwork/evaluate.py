@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ SWITCHING_PERIODS = (25, 50, 100, 200)  # control steps per option
 HANDOVER_AFTER = (100, 200)  # control steps of the first policy, uniform in this range in multiples of the segment
 HANDOVER_STEPS = 300  # control steps of the second
 HANDOVER_SPEED = 0.5  # m/s along the second, over all its steps, from which a hand-over counts as a success
+_PATH_STEPS = 10  # control steps between two looks at a path that no master leads
 _SEGMENT = 25  # control steps between two looks
 _NUM_DIRECTIONS = len(DIRECTIONS)
 _UNIT = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)  # of the directions, world frame
@@ -40,8 +41,8 @@ Report = Callable[[str], None]
 class Episodes:
     """One episode per row, and what its path was.
 
-    All arrays have a leading row axis; ``paths`` is [decisions + 1, N, 2] in m and
-    ``choices`` [decisions, N], of master rows only.
+    All arrays have a leading row axis; ``paths`` is [looks, N, 2] in m, at the start and after each
+    decision of a master, every tenth of others, and ``choices`` [decisions, N], of master rows only.
     """
 
     closest: np.ndarray  # m, to the goal
@@ -79,44 +80,63 @@ def play_episodes(
     num_threads: int = 0,
 ) -> Episodes:
     """Play ``num_episodes`` episodes of one seed's policy, all at once."""
-    experiment = trained.experiment
-    env = evaluation_environment(experiment, num_episodes, sub_policies, num_threads)
+    env = evaluation_environment(trained.experiment, num_episodes, sub_policies, num_threads)
     act = actor(trained, seed_index, env, deterministic)
-    stride = experiment.option_steps if experiment.is_master else 1
-    num_decisions = math.ceil(experiment.task.episode_steps / stride)
-    key = jax.random.key(seed)
-    state, obs = env.initial(jax.random.fold_in(key, 0))
-    goal_radius, dt = experiment.task.goal_radius or 0.0, stride * experiment.task.robot.control_dt
-    steps, paths, ended = [], [_positions(state)], []
     with closing(env.physics):
-        for i in range(num_decisions):
-            ended.append(np.asarray(_inner(state).held))
-            if ended[-1].all():
-                ended.pop()
-                break
-            state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
-            state = env.simulate(state, simulate_key)
-            state, step = finish_step(env, state, finish_key)
-            obs = step.obs
-            keep = (step.events, step.terms["progress"], action if experiment.is_master else ())
-            steps.append(jax.tree.map(np.asarray, keep))
-            if i % max(1, 10 // stride) == 0 or experiment.is_master:
-                paths.append(_positions(state))
-    events, progress, choices = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
-    over = np.stack(ended)
-    counts = lambda name: (events[name] & ~over).any(axis=0)  # noqa: E731
-    distance = np.where(over, np.inf, events["goal_distance"])
-    arrival = np.where((distance <= goal_radius).any(axis=0), (distance <= goal_radius).argmax(axis=0) + 1.0, np.nan)
+        course = _play_out(trained.experiment, env, act, jax.random.key(seed))
+    return _summary(trained.experiment, course)
+
+
+class _Course(NamedTuple):
+    """Episodes as they went: what is kept of each decision of the policy, [decisions, N]."""
+
+    events: dict[str, np.ndarray]
+    progress: np.ndarray
+    choices: np.ndarray  # of master rows; else no decisions
+    ended: np.ndarray  # before the decision
+    paths: np.ndarray  # [looks, N, 2] in m
+
+
+def _play_out(experiment: Experiment, env: Environment, act: Any, key: Key) -> _Course:
+    """Play until every row's episode has ended."""
+    stride = experiment.steps_per_decision
+    steps_per_look = 1 if experiment.is_master else _PATH_STEPS
+    state, obs = env.initial(jax.random.fold_in(key, 0))
+    kept, paths, ended = [], [_positions(state)], []
+    for i in range(math.ceil(experiment.task.episode_steps / stride)):
+        over = np.asarray(_inner(state).held)
+        if over.all():
+            break
+        ended.append(over)
+        state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
+        state, step = finish_step(env, env.simulate(state, simulate_key), finish_key)
+        obs = step.obs
+        keep = (step.events, step.terms["progress"], action if experiment.is_master else ())
+        kept.append(jax.tree.map(np.asarray, keep))
+        if i % steps_per_look == 0:
+            paths.append(_positions(state))
+    events, progress, choices = jax.tree.map(lambda *leaves: np.stack(leaves), *kept)
+    choices = choices if experiment.is_master else np.zeros((0, env.num_envs), np.int32)
+    return _Course(events, progress, choices, np.stack(ended), np.stack(paths))
+
+
+def _summary(experiment: Experiment, course: _Course) -> Episodes:
+    """What the episodes came to; a decision after a row's end counts for nothing."""
+    dt = experiment.task.robot.control_dt
+    distance = np.where(course.ended, np.inf, course.events["goal_distance"])
+    arrived = distance <= (experiment.task.goal_radius or 0.0)
+    decisions = np.where(arrived.any(axis=0), arrived.argmax(axis=0) + 1.0, np.nan)
+    progress = course.progress.sum(axis=0)
     return Episodes(
         closest=distance.min(axis=0),
-        fallen=counts("fallen"),
-        flipped=counts("flipped"),
-        progress=progress.sum(axis=0) * experiment.task.robot.control_dt,
-        distance=progress.sum(axis=0),
-        time_to_goal=arrival * dt,
-        paths=np.stack(paths),
-        choices=choices if experiment.is_master else np.zeros((0, num_episodes), np.int32),
-        ended=over,
+        fallen=(course.events["fallen"] & ~course.ended).any(axis=0),
+        flipped=(course.events["flipped"] & ~course.ended).any(axis=0),
+        progress=progress * dt,
+        distance=progress,
+        time_to_goal=decisions * (experiment.steps_per_decision * dt),
+        paths=course.paths,
+        choices=course.choices,
+        ended=course.ended,
     )
 
 

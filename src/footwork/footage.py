@@ -116,7 +116,7 @@ def film(
     experiment = trained.experiment
     env = evaluation_environment(experiment, num_episodes, sub_policies, num_threads)
     act = actor(trained, seed_index, env, deterministic)
-    stride = experiment.option_steps if experiment.is_master else 1
+    stride = experiment.steps_per_decision
     wanted = experiment.task.episode_steps if most_steps is None else min(most_steps, experiment.task.episode_steps)
     key = jax.random.key(seed)
     state, obs = env.initial(jax.random.fold_in(key, 0))
@@ -187,7 +187,7 @@ def _cut(
     experiment = trained.experiment
     length = int((~frames.over[:, n]).sum())
     row = jax.tree.map(lambda leaf: leaf[:length, n], frames)
-    stride = experiment.option_steps if experiment.is_master else 1
+    stride = experiment.steps_per_decision
     decisions = math.ceil(length / stride)
     odds, value = np.zeros((0, 4), np.float32), np.zeros(0, np.float32)
     if opinions:

@@ -92,6 +92,11 @@ class Experiment:
         return self.sub_policies is not None
 
     @property
+    def steps_per_decision(self) -> int:
+        """Control steps per action of its policy: a master's k, else one."""
+        return self.option_steps if self.is_master else 1
+
+    @property
     def runs_per_seed(self) -> int:
         """Learners side by side for one seed."""
         return len(DIRECTIONS) if self.is_walker and not self.symmetric else 1
@@ -165,7 +170,7 @@ def build_environment(
 
 def steps_per_iteration(experiment: Experiment) -> int:
     """Control steps that one run takes between updates."""
-    return experiment.ppo.batch_size * (experiment.option_steps if experiment.is_master else 1)
+    return experiment.ppo.batch_size * experiment.steps_per_decision
 
 
 def planned_steps(experiment: Experiment) -> int:
@@ -285,21 +290,41 @@ def train(
     """
     env = build_environment(experiment, len(seeds), needed, num_threads)
     compiling = compile_aside(experiment, len(seeds) * experiment.runs_per_seed)
-    learning = _resume(run, env, begin_learning(experiment, env, seeds))
-    per_iteration = steps_per_iteration(experiment)
-    total = planned_steps(experiment)
-    num_iterations = total // per_iteration
-    if learning.iteration > num_iterations:
-        at = learning.iteration * per_iteration
+    with closing(env.physics):
+        learning = _resume(run, env, begin_learning(experiment, env, seeds))
+        _check_not_beyond(experiment, run, learning)
+        learning = _learn(experiment, env, learning, seeds, run, compiling, checkpoint_seconds, tensorboard)
+        total = planned_steps(experiment)
+        _save(run, env, learning, total)
+    return _finish(experiment, seeds, run, learning, total)
+
+
+def _check_not_beyond(experiment: Experiment, run: RunDir, learning: Learning) -> None:
+    """Refuse to go on with a run that has taken more steps than it is asked for."""
+    at, total = learning.iteration * steps_per_iteration(experiment), planned_steps(experiment)
+    if at > total:
         raise ValueError(f"{run.path} is at step {at} already: total_steps must be at least that, got {total}")
-    last_save = time.monotonic()
+
+
+def _learn(
+    experiment: Experiment,
+    env: Environment,
+    learning: Learning,
+    seeds: tuple[int, ...],
+    run: RunDir,
+    compiling: Future[None],
+    checkpoint_seconds: float,
+    tensorboard: bool,
+) -> Learning:
+    """Iterate to the last planned step: what was learned. Logs every iteration, saves now and then and when stopped."""
+    per_iteration, total = steps_per_iteration(experiment), planned_steps(experiment)
+    step, last_save = learning.iteration * per_iteration, time.monotonic()
     with (
-        closing(env.physics),
         run.open_metrics(tensorboard) as log,
-        Progress(total, experiment.name, initial_step=learning.iteration * per_iteration) as progress,
+        Progress(total, experiment.name, initial_step=step) as progress,
         _stop_signals() as stop_asked,
     ):
-        while learning.iteration < num_iterations:
+        while step < total:
             begun = time.monotonic()
             learning, metrics = iterate(experiment, env, learning, seeds[0], compiling)
             step = learning.iteration * per_iteration
@@ -312,12 +337,12 @@ def train(
                 _save(run, env, learning, step)
                 last_save = time.monotonic()
             if stop_asked():
-                how = (
-                    "go on with --resume" if env.physics.resumable else f"but engine {experiment.engine} cannot resume"
-                )
-                raise Interrupted(f"stopped at step {step} of {total}; saved in {run.path}, {how}")
-    _save(run, env, learning, total)
-    return _finish(experiment, seeds, run, learning, total)
+                raise Interrupted(f"stopped at step {step} of {total}; saved in {run.path}, {_way_on(experiment, env)}")
+    return learning
+
+
+def _way_on(experiment: Experiment, env: Environment) -> str:
+    return "go on with --resume" if env.physics.resumable else f"but engine {experiment.engine} cannot resume"
 
 
 def _finish(experiment: Experiment, seeds: tuple[int, ...], run: RunDir, learning: Learning, step: int) -> Trained:

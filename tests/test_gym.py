@@ -48,6 +48,7 @@ def same(one, other):
         "import gymnasium, footwork",
         "import gymnasium.spaces\nimport footwork.arena\nimport gymnasium",
         "import gymnasium; gymnasium.spec",
+        "import footwork, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium",  # asked for only
     ],
 )
 def test_ids_are_known_whatever_is_imported_first_and_nothing_heavy_comes_along(code):

@@ -29,7 +29,8 @@ from websockets.sync.client import connect
 from footwork.doors import live, play
 from footwork.doors.cli import run
 from footwork.doors.live import Lesson
-from footwork.doors.play import House, Visit, open_server
+from footwork.doors.play import open_server
+from footwork.doors.visit import House, Visit
 from footwork.study.experiments import find_row
 from footwork.study.palette import DIRECTION_COLOURS, GOAL_COLOUR, rgb
 from footwork.study.runs import find_trained

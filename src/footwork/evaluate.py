@@ -16,11 +16,11 @@ import numpy as np
 from footwork.arena import DIRECTIONS, open_field
 from footwork.env import Env, Environment, split_phases
 from footwork.learn.networks import Policy
-from footwork.options import Options, OptionsState, SubPolicies
+from footwork.options import Options, OptionsState, SubPolicies, task_state
 from footwork.physics import DEFAULT_ENGINE, physics_for
 from footwork.regularisers import directions_of_rows
 from footwork.tasks.task import SUCCESS_RADII, Task
-from footwork.train import Experiment, Trained
+from footwork.train import Experiment, Trained, choices_of
 from footwork.types import Array, Key, Params
 
 IDLE_SPEED = 0.2  # m/s; an option slower than this has not moved the ant
@@ -104,7 +104,7 @@ def _play_out(experiment: Experiment, env: Environment, act: Any, key: Key) -> _
     state, obs = env.initial(jax.random.fold_in(key, 0))
     kept, paths, ended = [], [_positions(state)], []
     for i in range(math.ceil(experiment.task.episode_steps / stride)):
-        over = np.asarray(_inner(state).held)
+        over = np.asarray(task_state(state).held)
         if over.all():
             break
         ended.append(over)
@@ -142,15 +142,13 @@ def _summary(experiment: Experiment, course: _Course) -> Episodes:
 
 def actor(trained: Trained, seed_index: int, env: Environment, deterministic: bool) -> Any:
     """The jitted first call of a step: the policy under test, and the environment's begin."""
-    params = jax.tree.map(lambda leaf: leaf[seed_index], trained.params)
     experiment = trained.experiment
     if experiment.is_walker:
         walkers = trained.sub_policies(seed_index, deterministic)
         direction = jnp.array(env.goal_index)  # type: ignore[attr-defined]
         choose: Any = lambda obs, key: walkers.act(obs, direction, key)  # noqa: E731
     else:
-        single = jax.tree.map(lambda leaf: leaf[0], params)
-        choose = partial(_choose, experiment.policy(), single, deterministic)
+        choose = partial(_choose, experiment.policy(), trained.single(seed_index), deterministic)
 
     @jax.jit
     def act(state: Any, obs: Array, key: Key, i: Array) -> Any:
@@ -172,12 +170,8 @@ def finish_step(env: Environment, state: Any, key: Key) -> Any:
     return env.finish(state, key)
 
 
-def _inner(state: Any) -> Any:
-    return state.inner if isinstance(state, OptionsState) else state
-
-
 def _positions(state: Any) -> np.ndarray:
-    return np.asarray(_inner(state).physics.qpos)[:, :2].copy()
+    return np.asarray(task_state(state).physics.qpos)[:, :2].copy()
 
 
 def evaluate(
@@ -195,12 +189,11 @@ def evaluate(
     The intervals are over episodes, all seeds pooled: how much seeds differ is not in them.
     """
     experiment = trained.experiment
-    episodes = []
-    for index in range(len(trained.seeds)):
-        subs = None
-        if experiment.is_master and needed is not None:
-            subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
-        episodes.append(play_episodes(trained, subs, num_episodes, seed + index, index, deterministic, num_threads))
+    subs = choices_of(experiment, needed)
+    episodes = [
+        play_episodes(trained, subs, num_episodes, seed + index, index, deterministic, num_threads)
+        for index in range(len(trained.seeds))
+    ]
     closest = np.concatenate([e.closest for e in episodes])
     fallen, flipped = (np.concatenate([getattr(e, name) for e in episodes]) for name in ("fallen", "flipped"))
     progress, arrival = (np.concatenate([getattr(e, name) for e in episodes]) for name in ("progress", "time_to_goal"))

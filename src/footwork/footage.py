@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from footwork.env import Environment, EnvState
+from footwork.env import Environment
 from footwork.evaluate import actor, evaluation_environment, finish_step
 from footwork.learn.networks import Policy
-from footwork.options import Options, OptionsState, SubPolicies
+from footwork.options import Options, SubPolicies, task_state
 from footwork.tasks.task import Task
 from footwork.train import Trained
 from footwork.types import Array, Key, Params, TimeStep
@@ -127,7 +127,7 @@ def film(
         if np.asarray(task_state(state).held).all():
             break
         if experiment.is_master:
-            opinions.append(opinion(experiment.policy(), _single(trained, seed_index), obs))
+            opinions.append(opinion(experiment.policy(), trained.single(seed_index), obs))
         state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
         choice = _choice(trained, env, action)
         over = np.asarray(task_state(state).held)
@@ -150,20 +150,11 @@ def control_steps(env: Environment, state: Any, simulate_key: Key, finish_key: K
         yield state, state.total
 
 
-def task_state(state: Any) -> EnvState:
-    """The state of the task, below an option."""
-    return state.inner if isinstance(state, OptionsState) else state
-
-
 @partial(jax.jit, static_argnums=0)
 def opinion(policy: Policy, params: Params, obs: Array) -> tuple[Array, Array]:
     """A master's probabilities [N, 4], and its value [N], NaN without a critic."""
     odds = jax.nn.softmax(policy.outputs(params, obs))
     return odds, policy.value(params, obs) if "critic" in params else odds[:, 0] * np.nan
-
-
-def _single(trained: Trained, seed_index: int) -> Params:
-    return jax.tree.map(lambda leaf: leaf[seed_index, 0], trained.params)
 
 
 def _choice(trained: Trained, env: Environment, action: Array) -> np.ndarray:
@@ -221,4 +212,4 @@ def _outcome(row: _Frame) -> str:
     return "truncated"
 
 
-__all__ = ["NOBODY", "Footage", "control_steps", "film", "opinion", "task_state"]
+__all__ = ["NOBODY", "Footage", "control_steps", "film", "opinion"]

@@ -130,6 +130,10 @@ class Trained(NamedTuple):
             params = jax.tree.map(lambda leaf: leaf[0], params)
         return SubPolicies(self.experiment.policy(), params, self.experiment.symmetric, deterministic)
 
+    def single(self, seed_index: int = 0) -> Params:
+        """One seed's parameters without leading axes, of rows that train one policy per seed: a master, a flat one."""
+        return jax.tree.map(lambda leaf: leaf[seed_index, 0], self.params)
+
 
 class Learning(NamedTuple):
     """All that changes while a run learns."""
@@ -147,6 +151,18 @@ class Interrupted(RuntimeError):
     """The run was asked to stop, and has saved itself."""
 
 
+def choices_of(experiment: Experiment, needed: Trained | None) -> SubPolicies | None:
+    """The sub-policies that a master chooses among, acting as its row says; None for other rows.
+
+    Args:
+        experiment: the row.
+        needed: the policies of ``experiment.needs``.
+    """
+    if needed is None or not experiment.is_master:
+        return None
+    return needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
+
+
 def build_environment(
     experiment: Experiment, num_seeds: int, needed: Trained | None, num_threads: int = 0
 ) -> AutoReset:
@@ -158,10 +174,8 @@ def build_environment(
         raise ValueError(f"{experiment.name} needs the policies of {experiment.needs}")
     if not experiment.is_walker:
         env = Env(task, physics, staggered=True)
-        if needed is None:
-            return AutoReset(env)
-        subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
-        return AutoReset(Options(env, subs, experiment.option_steps))
+        subs = choices_of(experiment, needed)
+        return AutoReset(env if subs is None else Options(env, subs, experiment.option_steps))
     directions = directions_of_rows(num_envs // num_seeds, range(len(DIRECTIONS))) * num_seeds
     walker = Env(task, physics, directions, staggered=True)
     partners = None if needed is None else needed.sub_policies()

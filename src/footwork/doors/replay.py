@@ -21,10 +21,9 @@ from footwork.arena import DIRECTIONS, Arena
 from footwork.checkpoint import write_atomically
 from footwork.footage import Footage, film
 from footwork.physics.skeleton import skeleton
-from footwork.record import RunDir
 from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR
-from footwork.study.runs import find_needed, find_trained, load_run
-from footwork.train import Trained
+from footwork.study.runs import find_needed, find_trained
+from footwork.train import choices_of
 
 OUTCOMES = {
     "reached": "reached the goal",
@@ -121,18 +120,10 @@ def film_row(
         raise ValueError(f"episodes must be >= 1, got {episodes}")
     if most_steps is not None and most_steps < 1:
         raise ValueError(f"steps must be >= 1, got {most_steps}")
-    trained = find_policies(row, runs)
-    needed = find_needed(trained, runs)
-    subs = None if needed is None else needed.sub_policies(deterministic=trained.experiment.deterministic_sub_policies)
+    trained = find_trained(row, runs)
+    subs = choices_of(trained.experiment, find_needed(trained, runs))
     count = episodes * (len(DIRECTIONS) if trained.experiment.is_walker else 1)
     return film(trained, subs, count, seed, 0, deterministic, num_threads, most_steps)
-
-
-def find_policies(row: str, runs: Path) -> Trained:
-    """What a row name means, or the finished run in a directory of that name."""
-    if (Path(row) / "config.json").is_file():
-        return load_run(RunDir.open_existing(Path(row)))
-    return find_trained(row, runs)
 
 
 def page(template: str, title: str, styles: Sequence[str], scripts: Sequence[str], data: str) -> str:
@@ -230,4 +221,4 @@ def _base64(array: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-__all__ = ["Replay", "arena_extent", "film_row", "find_policies", "page", "replay"]
+__all__ = ["Replay", "arena_extent", "film_row", "page", "replay"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -105,6 +106,16 @@ def test_the_card_says_what_was_measured(exported):
     assert "2 episodes" in card
     assert "footwork train maze/hrl/plain --seeds" in card
     assert str(exported.parent) not in card + json.dumps(report)  # no path of this machine
+    named = set(re.findall(r"^\* .*$", card, re.MULTILINE))
+    for file in exported.iterdir():
+        assert file.name in ("README.md", "lock") or any(f"`{file.name}`" in line for line in named), file.name
+
+
+def test_an_export_shows_an_episode(exported):
+    page = (exported / "replay.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)[1])
+    assert [episode["row"] for episode in data["episodes"]] == ["maze/hrl/plain"]
+    assert not re.search(r"(src|href)=.https?:", page)
 
 
 def test_an_export_does_not_write_over_anything(exported):

@@ -1,4 +1,4 @@
-"""Policies out: a folder of weights, config and a model card with figures measured now.
+"""Policies out: a folder of weights, config, a replay, and a model card with figures measured now.
 
 The folder is a finished run like any other, so that it is accepted wherever a row is.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,14 @@ from typing import Any
 from footwork import checkpoint
 from footwork.arena import DIRECTIONS
 from footwork.checkpoint import write_atomically
+from footwork.doors.replay import Replay, film_trained
 from footwork.evaluate import evaluate
 from footwork.record import RunDir, config_to_json
 from footwork.study.runs import NEEDED, PACKAGED, find_needed, find_trained, packaged
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Trained
 
-Addition = Callable[[Trained, Trained | None, Path], Sequence[Path]]
+REPLAY = "replay.html"
 
 
 def export(
@@ -32,7 +32,6 @@ def export(
     seed: int = 1_000_003,
     num_threads: int = 0,
     onnx: bool = False,
-    additions: Sequence[Addition] = (),
 ) -> Path:
     """Write what an address means into the folder ``to``; returns the model card.
 
@@ -44,7 +43,6 @@ def export(
         seed: of the episodes.
         num_threads: of the physics; changes no number.
         onnx: also write ONNX files, those of the first seed.
-        additions: each adds files to the folder, such as a replay, and returns their paths.
 
     Raises:
         ValueError: the address is unknown.
@@ -63,8 +61,8 @@ def export(
         if needed is not None:
             checkpoint.save(to / NEEDED, needed.params, _meta(needed))
         files: list[Path] = list(write_onnx(trained, to)) if onnx else []
-        for add in additions:
-            files += add(trained, needed, to)
+        shown = film_trained(trained, needed, 1, seed, num_threads=num_threads)
+        Replay(tuple(shown), f"Footwork: {trained.experiment.name}").save(to / REPLAY)
         report = evaluate(trained, needed, episodes, seed, num_threads=num_threads)
         report["source"] = trained.experiment.name  # not where it lay on this machine
         write_atomically(to / "evaluation.json", json.dumps(report, indent=2).encode() + b"\n")
@@ -139,6 +137,7 @@ def _card(
         "* `policy.safetensors`: parameters with leading axes [seed, policy of that seed]; no pickle",
         *([f"* `{NEEDED}`: the sub-policies it stands on"] if needed else []),
         "* `config.json`, `evaluation.json`, `DONE`: the run, its figures, its end",
+        f"* `{REPLAY}`: an episode in 3-D, of sub-policies one in each direction; opens in a browser, fetches nothing",
         *(f"* `{path.relative_to(to)}`" for path in files),
         "",
         "## Limits",

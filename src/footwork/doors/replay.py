@@ -23,7 +23,7 @@ from footwork.footage import Footage, film
 from footwork.physics.skeleton import skeleton
 from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.study.runs import find_needed, find_trained
-from footwork.train import choices_of
+from footwork.train import Trained, choices_of
 
 OUTCOMES = {
     "reached": "reached the goal",
@@ -116,12 +116,29 @@ def film_row(
     most_steps: int | None = None,
 ) -> list[Footage]:
     """Film a row by name, or the run in a directory; of a walker row, ``episodes`` in each direction."""
+    trained = find_trained(row, runs)
+    return film_trained(trained, find_needed(trained, runs), episodes, seed, deterministic, num_threads, most_steps)
+
+
+def film_trained(
+    trained: Trained,
+    needed: Trained | None,
+    episodes: int = 1,
+    seed: int = 0,
+    deterministic: bool = False,
+    num_threads: int = 0,
+    most_steps: int | None = None,
+) -> list[Footage]:
+    """Film the first seed's policies; of a walker row, ``episodes`` in each direction.
+
+    Raises:
+        ValueError: not at least one episode, or one step.
+    """
     if episodes < 1:
         raise ValueError(f"episodes must be >= 1, got {episodes}")
     if most_steps is not None and most_steps < 1:
         raise ValueError(f"steps must be >= 1, got {most_steps}")
-    trained = find_trained(row, runs)
-    subs = choices_of(trained.experiment, find_needed(trained, runs))
+    subs = choices_of(trained.experiment, needed)
     count = episodes * (len(DIRECTIONS) if trained.experiment.is_walker else 1)
     return film(trained, subs, count, seed, 0, deterministic, num_threads, most_steps)
 
@@ -221,4 +238,4 @@ def _base64(array: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-__all__ = ["Replay", "arena_extent", "film_row", "page", "replay"]
+__all__ = ["Replay", "arena_extent", "film_row", "film_trained", "page", "replay"]

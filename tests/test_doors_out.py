@@ -227,6 +227,33 @@ def test_the_vec_env_refuses_other_reset_modes(vec_env):
         make_vector("CartPole-v1", 2)
 
 
+def test_staggered_rows_are_not_in_step_and_a_cut_is_a_truncation(vec_env):
+    from footwork.doors.sb3 import make_vec_env
+
+    rows, length = 24, 4
+    plain, staggered = (
+        make_vec_env("footwork/AntMaze-v0", rows, episode_steps=length, staggered=s) for s in (False, True)
+    )
+    for env in (plain, staggered):
+        env.seed(5)
+        env.reset()
+    first, ends = np.ones(rows, bool), []
+    for _ in range(3 * length):
+        obs, _, _, _ = plain.step(np.zeros((rows, 8), np.float32))
+        new_obs, _, done, infos = staggered.step(np.zeros((rows, 8), np.float32))
+        for row in np.flatnonzero(done):
+            assert infos[row]["TimeLimit.truncated"]
+            if first[row] and "episode" not in infos[row]:  # cut: the episode was the same so far
+                np.testing.assert_array_equal(infos[row]["terminal_observation"], obs[row])
+                assert not np.array_equal(new_obs[row], obs[row])
+            else:
+                assert infos[row]["episode"]["l"] == length
+        first &= ~done
+        ends.append(done)
+    assert all(0 < done.sum() < rows for done in ends[length:])  # phases are spread
+    assert (np.sum(ends[length : 2 * length], axis=0) == 1).all()
+
+
 @pytest.mark.parametrize("kind", ["master", "flat"])
 def test_the_example_trains(kind, monkeypatch):
     pytest.importorskip("stable_baselines3", reason="needs the extra footwork[sb3]")

@@ -16,6 +16,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from footwork.doors.sb3 import make_vec_env
+from footwork.evaluate import wilson
 
 MASTER, FLAT = "footwork/AntMazeOptions-v0", "footwork/AntWalker-v0"
 NEAR = 1.0  # m
@@ -35,11 +36,11 @@ def master(args):
     model = learn(env, settings, args.steps or 20_000, args)
     seen = make_vec_env(MASTER, args.episodes, every_info=True, num_threads=args.threads, **FIELDS)
     closest, flipped = play(model, seen, "goal_distance", np.minimum, "flipped")
-    reached = np.mean(closest <= NEAR)
-    print(
-        f"{args.episodes} episodes: {100 * reached:.1f} % within {NEAR} m, {100 * np.mean(flipped):.1f} % turned over"
-    )
-    return reached
+    near = closest <= NEAR
+    low, high = wilson(near)
+    within = f"{100 * near.mean():.1f} % [{100 * low:.1f}, {100 * high:.1f}] within {NEAR} m"
+    print(f"{args.episodes} episodes: {within}, {100 * flipped.mean():.1f} % turned over")
+    return near.mean()
 
 
 def flat(args):

@@ -45,7 +45,7 @@ class Footage:
         odds: [decisions, 4] float32, the master's probabilities; no rows where there is no master.
         value: [decisions] float32, the master's estimate; empty also where its critic was not packaged.
         option_steps: control steps per decision.
-        outcome: reached, fallen, flipped, diverged or truncated.
+        outcome: reached, fallen, flipped, diverged, truncated (time was up), or cut: filmed no further.
     """
 
     row: str
@@ -199,13 +199,13 @@ def _cut(
         odds=odds,
         value=value,
         option_steps=stride,
-        outcome=_outcome(row),
+        outcome=_outcome(row, length >= experiment.task.episode_steps),
     )
 
 
-def _outcome(row: _Frame) -> str:
+def _outcome(row: _Frame, whole: bool) -> str:
     if not row.terminated[-1]:
-        return "truncated"
+        return "truncated" if whole else "cut"
     for name in ("reached", "diverged", "flipped", "fallen"):
         if row.events[name][-1]:
             return name

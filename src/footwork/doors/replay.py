@@ -31,6 +31,7 @@ OUTCOMES = {
     "flipped": "turned over",
     "diverged": "simulation failed",
     "truncated": "time is up",
+    "cut": "not over yet",
 }
 
 

@@ -205,6 +205,9 @@ class Live extends Stage {
     const style = getComputedStyle(document.body), x = (u) => u * (canvas.width - 4) + 2, y = (v) => (1 - v) * (canvas.height - 4) + 2;
     pen.strokeStyle = style.getPropertyValue("--line");
     for (const v of [0, 0.5, 1]) pen.strokeRect(0, Math.round(y(v)) + 0.5, canvas.width, 0);
+    pen.fillStyle = style.getPropertyValue("--faint");
+    pen.font = `${10 * scale}px sans-serif`;
+    pen.fillText("100 %", 2, 11 * scale);
     pen.strokeStyle = this.hex[0];
     pen.lineWidth = 2 * scale;
     pen.beginPath();

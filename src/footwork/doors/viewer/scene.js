@@ -712,9 +712,11 @@ class Stage {
       const [x, y, halfX, halfY] = panel.extent;
       target = [x, y, 0];
       const tall = this.camera === "above" ? halfY : halfY * 0.86 + 1;
-      distance *= (1.04 * Math.max(tall, halfX / aspect)) / Math.tan(FOV / 2) / 10.5 + (this.camera === "above" ? 0.2 : 0);
-      // The card would hide the upper left corner: where the panel is wide enough, the arena stands right of it.
-      const aside = Math.min(CARD / box.w, 0.8 * Math.max(0, 1 - halfX / aspect / tall)) * distance * Math.tan(FOV / 2) * aspect;
+      // The card would hide the upper left corner: the arena stands right of it, a little smaller where there is no room.
+      const wide = halfX / aspect, fill = Math.max(tall, wide), beside = box.w > 2 * CARD ? wide / (1 - CARD / box.w) : 0;
+      const size = Math.max(fill, Math.min(beside, 1.2 * fill));
+      distance *= (1.04 * size) / Math.tan(FOV / 2) / 10.5 + (this.camera === "above" ? 0.2 : 0);
+      const aside = Math.min(CARD / box.w, 0.8 * (1 - wide / size)) * distance * Math.tan(FOV / 2) * aspect;
       target = minus(target, [-Math.sin(azimuth) * aside, Math.cos(azimuth) * aside, 0]);
     }
     target = plus(target, this.view.shift);

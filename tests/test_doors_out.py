@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,10 +12,12 @@ import jax
 import numpy as np
 import pytest
 
+from footwork.arena import MAZES
 from footwork.doors import cli
-from footwork.doors.export import export
+from footwork.doors.export import _own_fields, export
 from footwork.doors.policies import load_policy, of_trained
 from footwork.record import RunError
+from footwork.study.experiments import find_row
 from footwork.study.runs import find_needed, find_trained
 
 NOWHERE = Path("nowhere")
@@ -109,6 +112,13 @@ def test_the_card_says_what_was_measured(exported):
     named = set(re.findall(r"^\* .*$", card, re.MULTILINE))
     for file in exported.iterdir():
         assert file.name in ("README.md", "lock") or any(f"`{file.name}`" in line for line in named), file.name
+
+
+def test_the_card_names_the_fields_that_are_not_the_rows():
+    row = find_row("maze/hrl/plain")
+    assert _own_fields(replace(row, total_steps=7)) == ""
+    other = replace(row, option_steps=7, task=replace(row.task, arena=MAZES["spiral"]))
+    assert _own_fields(other) == "Other than the row's: `option_steps`, `task.arena`. "
 
 
 def test_an_export_shows_an_episode(exported):

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from footwork.doors import live, play
+from footwork.doors import visit as visit_module
 from footwork.doors.cli import run
 from footwork.doors.live import Lesson
 from footwork.doors.play import open_server
@@ -211,6 +213,27 @@ def test_a_scene_tells_the_page_of_the_maze(visit):
     assert scene["grid"] == list(visit.arena.grid)
     assert len(scene["walls"]) == len(visit.arena.walls)
     assert scene["ants"] == ["walker/symmetric-interleaved"]
+
+
+def test_ants_stand_on_the_engine_of_the_row(monkeypatch, heard):
+    asked, closed, make = [], [], live.physics_for
+
+    def physics_for(engine, *arguments):
+        asked.append(engine)
+        physics = make("mujoco", *arguments)
+        monkeypatch.setattr(physics, "close", lambda: closed.append(engine))
+        return physics
+
+    def on_bullet(row, runs):
+        trained = find_trained(row, runs)
+        return trained._replace(experiment=replace(trained.experiment, engine="bullet"))
+
+    monkeypatch.setattr(live, "physics_for", physics_for)
+    monkeypatch.setattr(visit_module, "find_trained", on_bullet)
+    visit = Visit(House(NOWHERE, ROW), heard.append)
+    assert visit.master_row().engine == "bullet"
+    visit.leave()
+    assert (asked, closed) == (["bullet"], ["bullet"])
 
 
 # ---------------------------------------------------------------- a lesson

@@ -17,9 +17,10 @@ from footwork.checkpoint import write_atomically
 from footwork.doors.replay import Replay, film_trained
 from footwork.evaluate import evaluate
 from footwork.record import RunDir, config_to_json
+from footwork.study.experiments import find_row, is_row
 from footwork.study.runs import NEEDED, PACKAGED, find_needed, find_trained, packaged
 from footwork.tasks.task import SUCCESS_RADII
-from footwork.train import Trained
+from footwork.train import Experiment, Trained
 
 REPLAY = "replay.html"
 
@@ -122,7 +123,7 @@ def _card(
         + ("" if batch == list(trained.seeds) else f"; this is seed {', '.join(map(str, trained.seeds))}")
         + ", with "
         + ", ".join(f"{name} {versions[name]}" for name in ("footwork", "jax", "mujoco"))
-        + ". `config.json` holds every field, those changed on the command line too.",
+        + f". {_own_fields(experiment)}`config.json` holds every field.",
         "",
         "## What it does",
         "",
@@ -145,6 +146,20 @@ def _card(
         "Trained and measured in simulation, on one kind of ant and in one arena. It knows nothing of another.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _own_fields(experiment: Experiment) -> str:
+    """Which fields are not those of the row of that name, as a sentence; nothing where all are."""
+    if not is_row(experiment.name):
+        return ""
+    own, row = config_to_json(experiment), config_to_json(find_row(experiment.name))
+    names = []
+    for name in own.keys() - {"total_steps"}:  # the length is told beside
+        if isinstance(own[name], dict) and isinstance(row[name], dict):
+            names += [f"{name}.{part}" for part, value in own[name].items() if value != row[name].get(part)]
+        elif own[name] != row[name]:
+            names.append(name)
+    return f"Other than the row's: {', '.join(f'`{name}`' for name in sorted(names))}. " if names else ""
 
 
 def _figures(report: dict[str, Any], seed: int) -> list[str]:

@@ -400,6 +400,28 @@ def test_ctrl_c_closes_cleanly():
     assert (process.returncode, out, err) == (0, "closing\n", "")
 
 
+def test_a_signal_before_the_server_serves_closes_it_too(monkeypatch):
+    """It may come between the line that tells the address and the loop."""
+
+    def interrupt(word, **_):
+        if word.startswith("http"):
+            signal.raise_signal(signal.SIGINT)
+
+    def give_up(*_):
+        raise AssertionError("the server was not closed")
+
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    monkeypatch.setattr("builtins.print", interrupt)
+    alarm = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(120)
+    try:
+        play.play(ROW, NOWHERE, "127.0.0.1", 0, 1)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, alarm)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
 # ---------------------------------------------------------------- in a browser
 
 

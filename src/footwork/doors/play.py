@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import signal
+import threading
 import time
 from collections.abc import Callable
 from http import HTTPStatus
@@ -171,18 +172,21 @@ def play(row: str, runs: Path, host: str, port: int, seats: int, lesson_steps: i
         raise ValueError(f"play shows masters (maze/hrl/..., bandit/hrl/...), not {trained.experiment.name}")
     house = House(runs, row, seats, lesson_steps)
     server = open_server(house, host, port)
-    old = [(number, signal.signal(number, signal.default_int_handler)) for number in (signal.SIGINT, signal.SIGTERM)]
+
+    def close(number: int, frame: Any) -> None:
+        house.closing.set()  # visitors' threads end at their next picture
+        threading.Thread(target=server.shutdown, name="closing").start()  # it waits for what this thread does
+
+    # A handler that asks and does not raise: before it serves, a server that is interrupted would never be closed.
+    old = [(number, signal.signal(number, close)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
         address = server.socket.getsockname()
         print(f"http://{address[0]}:{address[1]}/   (Ctrl-C ends it)", flush=True)
         server.serve_forever()
-    except KeyboardInterrupt:
         print("closing")
     finally:
-        house.closing.set()  # visitors' threads end at their next picture
-        server.shutdown()
         for number, handler in old:
-            signal.signal(number, handler)
+            signal.signal(number, handler)  # a second Ctrl-C does not wait for visitors
 
 
 __all__ = ["attend", "open_server", "play", "world"]

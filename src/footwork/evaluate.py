@@ -203,7 +203,7 @@ def evaluate(
             "success": None if success is None else {r: list(rate_over_seeds(hit)) for r, hit in success.items()},
             "fall_rate": list(rate_over_seeds(fallen)),
             "flip_rate": list(rate_over_seeds(flipped)),
-            "progress_m": list(mean_over_seeds(progress, generator)),
+            "progress_m": list(mean_over_seeds(list(progress), generator)),
             "time_to_goal_s": list(mean_over_seeds(arrival, generator)) if arrived.size else None,
         },
         "source": trained.source,

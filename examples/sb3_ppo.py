@@ -16,7 +16,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from footwork.doors.sb3 import make_vec_env
-from footwork.evaluate import wilson
+from footwork.statistics import wilson
 
 MASTER, FLAT = "footwork/AntMazeOptions-v0", "footwork/AntWalker-v0"
 NEAR = 1.0  # m
@@ -37,7 +37,7 @@ def master(args):
     seen = make_vec_env(MASTER, args.episodes, every_info=True, num_threads=args.threads, **FIELDS)
     closest, flipped = play(model, seen, "goal_distance", np.minimum, "flipped")
     near = closest <= NEAR
-    low, high = wilson(near)
+    low, high = wilson(near.sum(), near.size)
     within = f"{100 * near.mean():.1f} % [{100 * low:.1f}, {100 * high:.1f}] within {NEAR} m"
     print(f"{args.episodes} episodes: {within}, {100 * flipped.mean():.1f} % turned over")
     return near.mean()

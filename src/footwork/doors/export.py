@@ -186,8 +186,9 @@ def _figures(report: dict[str, Any], seed: int) -> list[str]:
     if report["time_to_goal_s"] is not None:
         rows.append(("time to the goal", f"{report['time_to_goal_s']:.1f} s"))
     seeds = ", ".join(map(str, report["seeds"]))
+    over = "episodes" if len(report["seeds"]) == 1 else "seeds and episodes"
     said = f"{report['episodes']} episodes (policy of seed {seeds}; episodes from seed {seed}), sampled actions, 95 %"
-    said += " intervals over episodes:"
+    said += f" intervals over {over}:"
     return [said, "", "| | |", "|---|---|", *(f"| {what} | {figure} |" for what, figure in rows)]
 
 

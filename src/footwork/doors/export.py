@@ -23,6 +23,14 @@ from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment, Trained
 
 REPLAY = "replay.html"
+_HEADER = (  # as model hubs read it
+    "---",
+    "library_name: footwork",
+    "license: mit",
+    "tags: [reinforcement-learning, hierarchical-reinforcement-learning, locomotion, mujoco, gymnasium]",
+    "---",
+    "",
+)
 
 
 def export(
@@ -93,37 +101,15 @@ def _card(
     to: Path,
 ) -> str:
     """The model card."""
-    experiment, versions = trained.experiment, meta["versions"]
-    kind = "A master" if experiment.is_master else "Sub-policies" if experiment.is_walker else "A flat policy"
-    batch = list(meta.get("batch", trained.seeds))
-    seeds = " ".join(map(str, batch))
-    arena, robot = experiment.task.arena.name, experiment.task.robot.name
-    stands = (
-        ""
-        if needed is None
-        else (
-            f" It chooses every {experiment.option_steps} control steps among the sub-policies of "
-            f"`{needed.experiment.name}`, which are in this folder too."
-        )
-    )
     lines = [
-        "---",
-        "library_name: footwork",
-        "license: mit",
-        "tags: [reinforcement-learning, hierarchical-reinforcement-learning, locomotion, mujoco, gymnasium]",
-        "---",
+        *_HEADER,
+        f"# {trained.experiment.name}",
         "",
-        f"# {experiment.name}",
-        "",
-        f"{kind} for {experiment.task.name} in arena `{arena}`, ant `{robot}`.{stands}",
+        _what_it_is(trained.experiment, needed),
         "",
         "## How it was trained",
         "",
-        f"`footwork train {experiment.name} --seeds {seeds}`, {meta['steps']:,} control steps per run"
-        + ("" if batch == list(trained.seeds) else f"; this is seed {', '.join(map(str, trained.seeds))}")
-        + ", with "
-        + ", ".join(f"{name} {versions[name]}" for name in ("footwork", "jax", "mujoco"))
-        + f". {_own_fields(experiment)}`config.json` holds every field.",
+        _how_it_was_trained(trained, meta),
         "",
         "## What it does",
         "",
@@ -146,6 +132,30 @@ def _card(
         "Trained and measured in simulation, on one kind of ant and in one arena. It knows nothing of another.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _what_it_is(experiment: Experiment, needed: Trained | None) -> str:
+    kind = "A master" if experiment.is_master else "Sub-policies" if experiment.is_walker else "A flat policy"
+    task = experiment.task
+    said = f"{kind} for {task.name} in arena `{task.arena.name}`, ant `{task.robot.name}`."
+    if needed is None:
+        return said
+    return (
+        f"{said} It chooses every {experiment.option_steps} control steps among the sub-policies of "
+        f"`{needed.experiment.name}`, which are in this folder too."
+    )
+
+
+def _how_it_was_trained(trained: Trained, meta: dict[str, Any]) -> str:
+    experiment, versions = trained.experiment, meta["versions"]
+    batch = list(meta.get("batch", trained.seeds))
+    seeds = " ".join(map(str, batch))
+    which = "" if batch == list(trained.seeds) else f"; this is seed {', '.join(map(str, trained.seeds))}"
+    tools = ", ".join(f"{name} {versions[name]}" for name in ("footwork", "jax", "mujoco"))
+    return (
+        f"`footwork train {experiment.name} --seeds {seeds}`, {meta['steps']:,} control steps per run{which}, with "
+        f"{tools}. {_own_fields(experiment)}`config.json` holds every field."
+    )
 
 
 def _own_fields(experiment: Experiment) -> str:

@@ -74,7 +74,7 @@ def _take_seat(house: House, name: str, tell: Callable[[dict[str, Any]], None]) 
 
 
 def _keep_company(house: House, visit: Visit, connection: ServerConnection) -> None:
-    last = time.monotonic()
+    last = due = time.monotonic()
     while not house.closing.is_set():
         _hear_all(visit, connection)
         now = time.monotonic()
@@ -82,9 +82,8 @@ def _keep_company(house: House, visit: Visit, connection: ServerConnection) -> N
         last = now
         visit.tell(visit.frame())
         visit.report_lesson()
-        left = last + 1 / FRAMES_PER_SECOND - time.monotonic()
-        if left > 0:
-            time.sleep(left)
+        due = max(due, now - 1 / FRAMES_PER_SECOND) + 1 / FRAMES_PER_SECOND  # a late picture is made up for by the next
+        time.sleep(max(0.0, due - time.monotonic()))
 
 
 def _hear_all(visit: Visit, connection: ServerConnection) -> None:

@@ -23,7 +23,7 @@ from footwork.train import Experiment, Trained
 SQUARE = "square"  # the open field with a goal at a corner: the bandit's
 MAX_CELLS = 13  # of a drawn maze, each way
 LESSON_STEPS = 1_000_000  # control steps
-FRAMES_PER_SECOND = 30
+FRAMES_PER_SECOND = 1 / 0.033  # two control steps each
 _LESSON_PERIOD = 0.5  # s between reports of a lesson
 _PACES = (0.25, 4.0)
 
@@ -289,7 +289,9 @@ class Visit:
     def step(self, seconds: float) -> None:
         """Let ``seconds`` go by; when the machine cannot keep up, the ant is slower, not the page."""
         dt = self.ants[0].task.robot.control_dt
-        self._behind = min(self._behind + (0.0 if self.paused else seconds * self.pace), 3 * self.pace / 30)
+        self._behind = min(
+            self._behind + (0.0 if self.paused else seconds * self.pace), 3 * self.pace / FRAMES_PER_SECOND
+        )
         if self.lesson_leads and "lesson" in self.leaders():
             self.who, self.lesson_leads = "lesson", False
         steps = 0

@@ -9,6 +9,11 @@ import numpy as np
 
 from footwork.arena import Arena
 from footwork.robot import ANKLE_SIGN, Robot
+from footwork.types import NUM_FEET
+
+# The contact sensors: floor_1 to floor_4, then feet_i_j in the order of these pairs.
+_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+PAIR_HAS_FOOT = np.array([[foot in pair for foot in range(NUM_FEET)] for pair in _PAIRS], np.float32)
 
 WALL_COLOUR = (0.55, 0.57, 0.62, 1.0)
 

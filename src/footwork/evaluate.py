@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from footwork.arena import DIRECTIONS, open_field
-from footwork.env import Env, Environment, split_phases
+from footwork.env import Env, Environment, loop_over, simulate, split_phases
 from footwork.learn.networks import Policy
 from footwork.options import Options, OptionsState, SubPolicies
 from footwork.physics import DEFAULT_ENGINE, physics_for
@@ -30,6 +30,7 @@ HANDOVER_AFTER = (100, 200)  # control steps of the first policy, uniform in thi
 HANDOVER_STEPS = 300  # control steps of the second
 HANDOVER_SPEED = 0.5  # m/s along the second, over all its steps, from which a hand-over counts as a success
 _SEGMENT = 25  # control steps between two looks
+_STRETCH = 100  # decisions at most between two looks whether all rows have ended, on a device
 _NUM_DIRECTIONS = len(DIRECTIONS)
 _UNIT = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)  # of the directions, world frame
 
@@ -87,23 +88,17 @@ def play_episodes(
     key = jax.random.key(seed)
     state, obs = env.initial(jax.random.fold_in(key, 0))
     goal_radius, dt = experiment.task.goal_radius or 0.0, stride * experiment.task.robot.control_dt
-    steps, paths, ended = [], [_positions(state)], []
+    play = loop_over(env.physics, partial(_decision, env, act, key))
+    stretch = math.gcd(num_decisions, _STRETCH) if env.physics.traceable else 1  # of one length: it is compiled once
+    seen, start = [], _positions(state)
     with closing(env.physics):
-        for i in range(num_decisions):
-            ended.append(np.asarray(_inner(state).held))
-            if ended[-1].all():
-                ended.pop()
+        for first in range(0, num_decisions, stretch):
+            if np.asarray(_inner(state).held).all():
                 break
-            state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
-            state = env.simulate(state, simulate_key)
-            state, step = finish_step(env, state, finish_key)
-            obs = step.obs
-            keep = (step.events, step.terms["progress"], action if experiment.is_master else ())
-            steps.append(jax.tree.map(np.asarray, keep))
-            if i % max(1, 10 // stride) == 0 or experiment.is_master:
-                paths.append(_positions(state))
-    events, progress, choices = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
-    over = np.stack(ended)
+            (state, obs), kept = play((state, obs), np.arange(first + 1, first + 1 + stretch, dtype=np.int32))
+            seen.append(jax.tree.map(np.asarray, kept))
+    over, positions, events, progress, choices = jax.tree.map(lambda *leaves: np.concatenate(leaves), *seen)
+    paths = np.concatenate([start[None], positions[:: 1 if experiment.is_master else 10]])
     counts = lambda name: (events[name] & ~over).any(axis=0)  # noqa: E731
     distance = np.where(over, np.inf, events["goal_distance"])
     arrival = np.where((distance <= goal_radius).any(axis=0), (distance <= goal_radius).argmax(axis=0) + 1.0, np.nan)
@@ -114,10 +109,21 @@ def play_episodes(
         progress=progress.sum(axis=0) * experiment.task.robot.control_dt,
         distance=progress.sum(axis=0),
         time_to_goal=arrival * dt,
-        paths=np.stack(paths),
+        paths=paths,
         choices=choices if experiment.is_master else np.zeros((0, num_episodes), np.int32),
         ended=over,
     )
+
+
+def _decision(env: Environment, act: Any, key: Key, playing: tuple[Any, Array], number: Array) -> tuple[Any, Any]:
+    """One decision of the policy under test, as the body of a loop, and what is kept of it."""
+    state, obs = playing
+    over = _inner(state).held
+    state, action, simulate_key, finish_key = act(state, obs, key, number)
+    state = env.simulate(state, simulate_key)
+    state, step = finish_step(env, state, finish_key)
+    choice = action if isinstance(env, Options) else ()
+    return (state, step.obs), (over, _inner(state).physics.qpos[:, :2], step.events, step.terms["progress"], choice)
 
 
 def actor(trained: Trained, seed_index: int, env: Environment, deterministic: bool) -> Any:
@@ -260,8 +266,8 @@ class _Walk:
 
     def run(self, state: OptionsState, choice: np.ndarray, segment: int) -> tuple[OptionsState, Any]:
         """One segment: the state after it and what was counted."""
-        begin, simulate, finish = split_phases(jax.random.fold_in(self.key, 1 + segment))
-        state = self.env.simulate(self.env.begin(state, jnp.asarray(choice), begin), simulate)
+        begin, simulating, finish = split_phases(jax.random.fold_in(self.key, 1 + segment))
+        state = simulate(self.env, self.env.begin(state, jnp.asarray(choice), begin), simulating)
         state, step = finish_step(self.env, state, finish)
         return state, step.events
 

@@ -5,7 +5,6 @@ The loops are tested on an engine without mechanics; what needs MJX itself needs
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib.util import find_spec
 
 import jax
@@ -20,7 +19,6 @@ from footwork.arena import open_field
 from footwork.evaluate import play_episodes, transitions
 from footwork.physics import physics_for
 from footwork.record import RunDir, read_metrics
-from footwork.robot import ROBOTS
 from footwork.study.experiments import with_engine
 from footwork.train import begin_learning, build_environment, iterate
 from footwork.types import PhysicsState

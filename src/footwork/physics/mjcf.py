@@ -7,7 +7,7 @@ from importlib import resources
 import mujoco
 import numpy as np
 
-from footwork.arena import Arena
+from footwork.arena import Arena, open_field
 from footwork.robot import ANKLE_SIGN, Robot
 from footwork.types import NUM_FEET
 
@@ -66,3 +66,10 @@ def _write_joint(joint: mujoco.MjsJoint, robot: Robot) -> None:
 def build_model(robot: Robot, arena: Arena) -> mujoco.MjModel:
     """The compiled model."""
     return build_spec(robot, arena).compile()
+
+
+def masses(robot: Robot) -> dict[str, float]:
+    """Of the compiled ant, kg: all of it, the torso with its four stubs, one thigh, one shin."""
+    model = build_model(robot, open_field())
+    of = {name: float(model.body(name).mass[0]) for name in ("torso", "thigh_1", "shin_1")}
+    return {"ant": float(model.body_mass.sum()), "torso": of["torso"], "thigh": of["thigh_1"], "shin": of["shin_1"]}

@@ -24,7 +24,7 @@ from footwork.types import NUM_FEET, QPOS_SIZE, QVEL_SIZE, Array, Bool, Float, P
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which it could also run on, is missing
     from mujoco import mjx
 
-# MJX runs all steps of a line search, needed or not; MuJoCo in C stops when it has found the minimum, well before these.
+# MJX runs every step of a line search, needed or not; MuJoCo in C stops at the minimum, well before these.
 LINE_SEARCH_STEPS = 8
 
 
@@ -44,8 +44,8 @@ class MjxPhysics:
     is float32, as JAX has it; an engine made and stepped within ``jax.enable_x64()`` computes in float64.
 
     A foot's contact bits are, as in C, those of the beginning of the last substep, and a row that was just reset
-    touches nothing yet. A row that holds a number which is not finite, or beyond what MuJoCo in C allows, is reported in
-    ``diverged`` until it is reset. Rows outside ``active`` are held, but cost as much as the others.
+    touches nothing yet. A row that holds a number which is not finite, or that MuJoCo in C would not go on with, is
+    reported in ``diverged`` until it is reset. Rows outside ``active`` are held, but cost as much as the others.
 
     Args:
         robot: the ant.

@@ -11,11 +11,12 @@ import pytest
 
 from footwork import evaluate as evaluating
 from footwork.arena import DIRECTIONS, Arena, open_field
-from footwork.evaluate import bootstrap_mean, evaluate, handover_matrix, play_episodes, random_switching, wilson
+from footwork.evaluate import evaluate, handover_matrix, play_episodes, random_switching
 from footwork.learn.config import PPOConfig
 from footwork.learn.networks import gaussian_policy
 from footwork.options import SubPolicies
 from footwork.robot import HEAVY
+from footwork.statistics import wilson
 from footwork.study.experiments import ANT_BANDIT, ANT_WALKER
 from footwork.tasks.terms import PENALISED_WEIGHTS
 from footwork.train import Experiment, Trained
@@ -201,7 +202,7 @@ def test_success_counts_the_closest_approach(glider):
     report = evaluate(trained, None, 200, seed=7, deterministic=True)
     shares = np.cumsum(counts) / 200
     assert report["success"] == pytest.approx({"0.45": shares[0], "0.5": shares[1], "1.0": shares[2], "5.0": shares[3]})
-    assert report["interval"]["success"]["1.0"] == wilson(goal < 3)
+    assert report["interval"]["success"]["1.0"] == pytest.approx(list(wilson((goal < 3).sum(), 200)))
     assert (report["episodes"], report["fall_rate"], report["flip_rate"]) == (200, 0.0, 0.0)
     # time to the radius of the task, 0.5 m, where it was reached
     entry = np.array([3.0 - np.sqrt(0.25 - ASIDE[i] ** 2) for i in (0, 1)]) / TOP_SPEED
@@ -257,28 +258,6 @@ def test_a_masters_choices_and_path_are_kept(glider):
     assert arrival < episodes.time_to_goal[0] <= arrival + 10 * DT  # rounded up to a whole option
     assert decisions == np.ceil((3.0 - 0.45) / 2.0 / (10 * DT))  # and then it is over
     np.testing.assert_allclose(episodes.closest, 0.44, atol=0.02)
-
-
-# ---------------------------------------------------------------- intervals
-
-
-# Newcombe 1998, Statistics in Medicine 17, Table I, method 3 (score without continuity correction).
-@pytest.mark.parametrize(
-    ("hits", "of", "interval"),
-    [(81, 263, (0.2553, 0.3662)), (15, 148, (0.0624, 0.1605)), (0, 20, (0.0, 0.1611)), (1, 29, (0.0061, 0.1718))],
-)
-def test_wilson_agrees_with_newcombes_table(hits, of, interval):
-    assert wilson(np.arange(of) < hits) == pytest.approx(interval, abs=5e-5)
-    mirrored = wilson(np.arange(of) >= hits)
-    assert mirrored == pytest.approx([1 - interval[1], 1 - interval[0]], abs=5e-5)
-
-
-def test_the_bootstrap_agrees_with_theory():
-    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
-    low, high = bootstrap_mean(values, seed=1)
-    assert (low, high) == pytest.approx((values.mean() - 0.196, values.mean() + 0.196), abs=0.03)
-    assert bootstrap_mean(values, seed=1) == [low, high]
-    assert bootstrap_mean(np.full(5, 2.5), seed=0) == [2.5, 2.5]
 
 
 def test_the_switching_task_never_ends():

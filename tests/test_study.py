@@ -14,11 +14,11 @@ from footwork.arena import MAZES
 from footwork.doors.cli import run
 from footwork.evaluate import Episodes
 from footwork.record import RunDir, RunError, read_metrics
+from footwork.statistics import Effect
 from footwork.study import claims, measure, plan, report, results
 from footwork.study.experiments import EXPERIMENTS, GRIDS, MAIN, find_row, match_rows
 from footwork.study.figures import FIGURES, draw_figures, find_figures
 from footwork.study.plan import FULL, QUICK, Study
-from footwork.study.statistics import Effect
 
 WALKERS = ("walker/plain", "walker/random-start", "walker/random-repeated", "walker/appropriate-bias")
 KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias")

@@ -19,6 +19,7 @@ from footwork.learn.networks import Policy
 from footwork.options import Options, OptionsState, SubPolicies
 from footwork.physics import DEFAULT_ENGINE, physics_for
 from footwork.regularisers import directions_of_rows
+from footwork.statistics import mean_over_seeds, rate_over_seeds
 from footwork.tasks.task import SUCCESS_RADII, Task
 from footwork.train import Experiment, Trained
 from footwork.types import Array, Key, Params
@@ -178,7 +179,7 @@ def evaluate(
 
     Success is judged at several radii from the closest approach; a walker's is None, its targets being
     10 km away. Time to goal is known to one decision of the policy: a master's is rounded up to a whole option.
-    The intervals are over episodes, all seeds pooled: how much seeds differ is not in them.
+    The intervals are over seeds and episodes (:mod:`footwork.statistics`); one seed says nothing about others.
     """
     experiment = trained.experiment
     episodes = []
@@ -187,10 +188,12 @@ def evaluate(
         if experiment.is_master and needed is not None:
             subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
         episodes.append(play_episodes(trained, subs, num_episodes, seed + index, index, deterministic, num_threads))
-    closest = np.concatenate([e.closest for e in episodes])
-    fallen, flipped = (np.concatenate([getattr(e, name) for e in episodes]) for name in ("fallen", "flipped"))
-    progress, arrival = (np.concatenate([getattr(e, name) for e in episodes]) for name in ("progress", "time_to_goal"))
-    arrival = arrival[np.isfinite(arrival)]
+    closest, fallen, flipped, progress = (
+        np.stack([getattr(e, name) for e in episodes]) for name in ("closest", "fallen", "flipped", "progress")
+    )
+    arrival = [e.time_to_goal[np.isfinite(e.time_to_goal)] for e in episodes]
+    arrived = np.concatenate(arrival)
+    generator = np.random.default_rng(seed)
     success = None if experiment.is_walker else {str(radius): closest <= radius for radius in SUCCESS_RADII}
     report: dict[str, Any] = {
         "row": experiment.name,
@@ -201,13 +204,13 @@ def evaluate(
         "fall_rate": float(fallen.mean()),
         "flip_rate": float(flipped.mean()),
         "progress_m": float(progress.mean()),
-        "time_to_goal_s": float(arrival.mean()) if arrival.size else None,
+        "time_to_goal_s": float(arrived.mean()) if arrived.size else None,
         "interval": {
-            "success": None if success is None else {radius: wilson(hit) for radius, hit in success.items()},
-            "fall_rate": wilson(fallen),
-            "flip_rate": wilson(flipped),
-            "progress_m": bootstrap_mean(progress, seed),
-            "time_to_goal_s": bootstrap_mean(arrival, seed) if arrival.size else None,
+            "success": None if success is None else {r: list(rate_over_seeds(hit)) for r, hit in success.items()},
+            "fall_rate": list(rate_over_seeds(fallen)),
+            "flip_rate": list(rate_over_seeds(flipped)),
+            "progress_m": list(mean_over_seeds(list(progress), generator)),
+            "time_to_goal_s": list(mean_over_seeds(arrival, generator)) if arrived.size else None,
         },
         "source": trained.source,
     }
@@ -224,22 +227,6 @@ def _speed_by_direction(experiment: Experiment, episodes: list[Episodes]) -> dic
         name: [float(block[direction].mean() / seconds) for block in blocks]
         for direction, name in enumerate(DIRECTIONS)
     }
-
-
-def wilson(hits: np.ndarray) -> list[float]:
-    """95 % interval of a rate (Wilson 1927), which stays honest at 0 and at 1."""
-    n, z = max(hits.size, 1), 1.959964
-    rate = hits.mean() if hits.size else 0.0
-    middle = (rate + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    return [float(max(middle - half, 0.0)), float(min(middle + half, 1.0))]
-
-
-def bootstrap_mean(values: np.ndarray, seed: int, draws: int = 1000) -> list[float]:
-    """95 % percentile-bootstrap interval of a mean."""
-    generator = np.random.default_rng(seed)
-    means = [generator.choice(values, values.size).mean() for _ in range(draws)]
-    return [float(bound) for bound in np.percentile(means, (2.5, 97.5))]
 
 
 def switching_task(task: Task) -> Task:
@@ -414,7 +401,6 @@ def transitions(
 __all__ = [
     "Episodes",
     "actor",
-    "bootstrap_mean",
     "evaluate",
     "evaluation_environment",
     "finish_step",
@@ -423,5 +409,4 @@ __all__ = [
     "random_switching",
     "switching_task",
     "transitions",
-    "wilson",
 ]

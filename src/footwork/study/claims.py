@@ -29,9 +29,7 @@ from typing import Literal
 
 import numpy as np
 
-from footwork.study.experiments import MAIN, find_row, is_row
-from footwork.study.results import METRICS, Results
-from footwork.study.statistics import (
+from footwork.statistics import (
     Effect,
     Floats,
     Statistic,
@@ -41,6 +39,8 @@ from footwork.study.statistics import (
     probability_of_improvement,
     spread,
 )
+from footwork.study.experiments import MAIN, find_row, is_row
+from footwork.study.results import METRICS, Results
 
 Rule = Literal["greater", "not worse", "same", "at least", "at most"]
 Verdict = Literal["holds", "does not hold", "undecided"]

@@ -19,9 +19,9 @@ import numpy as np
 from footwork.arena import DIRECTIONS
 from footwork.checkpoint import CheckpointError, write_atomically
 from footwork.record import RunDir, RunError, config_from_json, read_metrics
+from footwork.statistics import Floats
 from footwork.study.measure import EVALUATION, TRANSITIONS, problem_with
 from footwork.study.plan import Study
-from footwork.study.statistics import Floats
 from footwork.train import Experiment, planned_steps, steps_per_iteration
 
 CURVE = "curve.json"

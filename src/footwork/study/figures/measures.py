@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from footwork.arena import DIRECTIONS
+from footwork.statistics import Effect, contrast, generator_for, performance_profile
 from footwork.study.experiments import GRIDS, Grid
 from footwork.study.figures.style import Look, empty, interval_marks, label_of, legend_below, look_of, panels
 from footwork.study.measure import TRANSITIONS
 from footwork.study.results import METRICS, Results
-from footwork.study.statistics import Effect, contrast, generator_for, performance_profile
 
 _ARROWS = dict(zip(DIRECTIONS, ("→", "↑", "←", "↓"), strict=True))
 

@@ -152,18 +152,54 @@ def curve_band(curves: npt.ArrayLike, generator: np.random.Generator, draws: int
     return iqm(values, axis=0), percentile_interval(samples)
 
 
-def wilson(hits: int, count: int) -> tuple[float, float]:
-    """95 % interval of a rate (Wilson 1927).
+def wilson(hits: float, count: float) -> tuple[float, float]:
+    """95 % interval of a rate (Wilson 1927), which stays honest at 0 and at 1.
 
     Raises:
         ValueError: not 0 <= hits <= count, or count is 0.
     """
-    if count < 1 or not 0 <= hits <= count:
-        raise ValueError(f"0 <= hits <= count and count >= 1, got {hits} of {count}")
+    if not count > 0 or not 0 <= hits <= count:
+        raise ValueError(f"0 <= hits <= count and count > 0, got {hits} of {count}")
     z, rate = 1.959964, hits / count
     middle = (rate + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
     return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def rate_over_seeds(hits: npt.ArrayLike) -> tuple[float, float]:
+    """95 % interval of a rate from E episodes of each of S seeds: hits, bool [S, E].
+
+    Wilson's, with as many episodes as they are worth: their number over the design effect (Kish
+    1965), the variance of the seeds' rates over what binomial chance alone would give, at least 1.
+    Seeds that differ widen the interval; with one seed it says nothing about others.
+    """
+    by_seed = np.atleast_2d(np.asarray(hits, bool))
+    seeds, episodes = by_seed.shape
+    rate = float(by_seed.mean())
+    by_chance = rate * (1 - rate) / episodes
+    across = float(np.var(by_seed.mean(axis=1), ddof=1)) if seeds > 1 else 0.0
+    count = by_seed.size / max(1.0, across / by_chance if by_chance > 0 else 1.0)
+    return wilson(rate * count, count)
+
+
+def mean_over_seeds(
+    values: Sequence[npt.ArrayLike], generator: np.random.Generator, draws: int = DRAWS
+) -> tuple[float, float]:
+    """95 % bootstrap interval of the mean of all episodes: seeds are drawn, and then episodes of each.
+
+    Args:
+        values: one array per seed, of any length but not all empty; of a seed without values nothing is drawn.
+        generator: of the resamples.
+        draws: resamples.
+    """
+    groups = [np.asarray(group, np.float64) for group in values if np.size(group)]
+    means = np.empty(draws)
+    for draw in range(draws):
+        chosen = [groups[i] for i in generator.integers(0, len(groups), len(groups))]
+        again = [group[generator.integers(0, group.size, group.size)] for group in chosen]
+        means[draw] = sum(part.sum() for part in again) / sum(part.size for part in again)
+    low, high = percentile_interval(means)
+    return float(low), float(high)
 
 
 __all__ = [
@@ -175,10 +211,12 @@ __all__ = [
     "curve_band",
     "generator_for",
     "iqm",
+    "mean_over_seeds",
     "overall_iqm",
     "percentile_interval",
     "performance_profile",
     "probability_of_improvement",
+    "rate_over_seeds",
     "resample",
     "spread",
     "wilson",

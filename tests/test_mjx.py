@@ -254,3 +254,13 @@ def test_a_row_trains_on_mjx(row, tmp_path):
     assert all(np.isfinite(line[name]).all() for line in lines for name in ("policy_loss", "rollout/progress"))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(trained.params))
     assert trained.experiment.engine == "mjx"
+
+
+@mjx
+def test_a_run_on_mjx_goes_on_bit_for_bit(tmp_path):
+    once, twice = (with_engine(tiny("walker/interleaved", iterations), "mjx") for iterations in (1, 2))
+    straight = training.train(twice, (0,), RunDir.create(tmp_path / "straight", {}))
+    run = RunDir.create(tmp_path / "stopped", {})
+    training.train(once, (0,), run)
+    resumed = training.train(twice, (0,), run)
+    jax.tree.map(np.testing.assert_array_equal, straight.params, resumed.params)

@@ -39,7 +39,7 @@ class Tally(NamedTuple):
 
 def start(env: Environment, key: Key) -> Carry:
     """A first episode in every row."""
-    state, obs = jax.jit(env.initial)(key) if env.physics.traceable else env.initial(key)
+    state, obs = env.initial(key)
     _, shape = jax.eval_shape(env.finish, state, key)
     zeros = {name: jnp.zeros(env.num_envs) for name in shape.terms}
     return Carry(state, obs, EpisodeSums(zeros, jnp.zeros(env.num_envs, jnp.int32)))

@@ -6,6 +6,8 @@ one body of code measures them all. What is not installed is skipped, and named.
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -35,6 +37,7 @@ from footwork.types import NUM_JOINTS, Physics, PhysicsState
 Say = Callable[[str], None]
 ROWS = 64  # ants side by side in every measurement
 BITS_ASKED = 0.999  # of MJX's contact bits, to be C's
+THROWN = 3.0  # m/s at most along x and y, into the walls where there are any
 _EVERY = 10  # control steps between two shared states; an action is held as long
 
 
@@ -135,10 +138,8 @@ class Parity:
         self.found["statistics"] = {}
         for ant in self.ants:
             steps = self.size.device_episode if ant == DEVICE else self.size.episode
-            self.found["statistics"][ant.name] = {}
-            for kind in TORQUES:
-                self.say(f"{ant.name}: {kind}, {steps} control steps")
-                self.found["statistics"][ant.name][kind] = wander(ant, kind, steps)
+            self.say(f"{ant.name}: {', '.join(TORQUES)} torque, {steps} control steps each")
+            self.found["statistics"][ant.name] = wander(ant, steps)
 
     def _transfer(self) -> None:
         """Policies that were trained on one engine, handed over on each."""
@@ -241,13 +242,14 @@ def single_steps(arena: Arena, num_states: int, say: Say) -> dict[str, Any]:
 def shared_states(
     physics: Physics, robot: Robot, arena: Arena, generator: np.random.Generator, rounds: int
 ) -> Iterator[tuple[PhysicsState, np.ndarray]]:
-    """States [ROWS] that ants under random torque come to, and the next action of each; anew every 20 rounds."""
+    """States [ROWS] that ants under random torque come to, and the next action of each; thrown anew every 20 rounds."""
     for number in range(rounds):
         if number % 20 == 0:
             key = jax.random.key(number)
             qpos = np.array(replace(ANT_WALKER, robot=robot).reset_pose(key, ROWS)[0])
-            qpos[:, :2] = beside_walls(arena, generator)
-            state = place(physics, qpos)
+            qpos[:, :2], qvel = beside_walls(arena, generator), np.zeros((ROWS, 14), np.float32)
+            qvel[:, :2] = generator.uniform(-THROWN, THROWN, (ROWS, 2))
+            state = place(physics, qpos, qvel)
         action = generator.uniform(-1.0, 1.0, (ROWS, NUM_JOINTS)).astype(np.float32)
         for _ in range(_EVERY):
             state = physics.step(state, action)
@@ -255,12 +257,12 @@ def shared_states(
 
 
 def beside_walls(arena: Arena, generator: np.random.Generator) -> np.ndarray:
-    """Places [ROWS, 2], within a stride of a wall where there are any."""
+    """Places [ROWS, 2], within a stride of a wall where there are any, and no leg in it."""
     if not arena.walls:
         return np.zeros((ROWS, 2))
     reach = max(abs(wall.x) + wall.half_x for wall in arena.walls)
     near = generator.uniform(-reach, reach, (4000, 2))
-    near = near[inside_walls(arena, near, 1.2) & ~inside_walls(arena, near, 0.5)]
+    near = near[inside_walls(arena, near, 1.6) & ~inside_walls(arena, near, 1.2)]
     return near[:ROWS]
 
 
@@ -276,44 +278,45 @@ def quantiles(values: np.ndarray) -> dict[str, float]:
 TORQUES = {"zero": (0.0, 1), "random": (1.0, 1), "random, held 10 steps": (1.0, 10)}  # scale, and steps held
 
 
-def wander(ant: Ant, kind: str, num_steps: int) -> dict[str, float]:
-    """ROWS ants under a torque that nobody chose.
+def wander(ant: Ant, num_steps: int) -> dict[str, dict[str, float]]:
+    """ROWS ants under torque that nobody chose, by its kind; the same torques for every ant.
 
     Returns:
         Share still alive at the end (torso never at or below the fall height), share upside down at the end; while
         alive, the mean height (m) and horizontal speed (m/s) of the torso and the share of feet on the floor.
     """
-    robot, (scale, held) = ROBOTS[ant.robot], TORQUES[kind]
-    task, key = replace(ANT_WALKER, robot=robot), jax.random.key(0)
-    with closing(physics_for(ant.engine, robot, task.arena, ROWS)) as physics:
-        draw = jax.jit(partial(_draw, key, scale, held))
-        run = loop_over(physics, partial(_wandering, physics, draw))
-        state = place(physics, *map(np.asarray, task.reset_pose(key, ROWS)))
-        state, (height, speed, feet) = run(state, np.arange(num_steps, dtype=np.int32))
-    alive = np.logical_and.accumulate(np.asarray(height) > robot.fall_height, axis=0)
-    over_alive = lambda values: float(np.asarray(values)[alive].mean())  # noqa: E731
-    w_x_y_z = np.asarray(state.qpos)[:, 3:7]
-    return {
-        "steps": num_steps,
-        "alive": float(alive[-1].mean()),
-        "fallen_at": float(np.median(alive.sum(axis=0)) + 1),
-        "upside_down": float((1.0 - 2.0 * (w_x_y_z[:, 1] ** 2 + w_x_y_z[:, 2] ** 2) < 0.0).mean()),
-        "height_m": over_alive(height),
-        "speed_mps": over_alive(speed),
-        "feet_down": over_alive(feet),
-    }
+    robot = ROBOTS[ant.robot]
+    pose = replace(ANT_WALKER, robot=robot).reset_pose(jax.random.key(0), ROWS)
+    found = {}
+    with closing(physics_for(ant.engine, robot, ANT_WALKER.arena, ROWS)) as physics:
+        run = loop_over(physics, partial(_wandering, physics))
+        for kind, (scale, held) in TORQUES.items():
+            shape = (-(-num_steps // held), ROWS, NUM_JOINTS)
+            drawn = np.random.default_rng(0).uniform(-scale, scale, shape).astype(np.float32)
+            state, seen = run(place(physics, *map(np.asarray, pose)), drawn.repeat(held, axis=0)[:num_steps])
+            found[kind] = _summary(robot, np.asarray(state.qpos), *map(np.asarray, seen))
+    return found
 
 
-def _draw(key: Any, scale: float, held: int, number: Any) -> Any:
-    return jax.random.uniform(jax.random.fold_in(key, number // held), (ROWS, NUM_JOINTS), minval=-scale, maxval=scale)
-
-
-def _wandering(physics: Physics, draw: Any, state: PhysicsState, number: Any) -> tuple[PhysicsState, Any]:
+def _wandering(physics: Physics, state: PhysicsState, action: Any) -> tuple[PhysicsState, Any]:
     """A control step, as the body of a loop."""
     xp = jnp if physics.traceable else np
-    state = physics.step(state, draw(number))
+    state = physics.step(state, action)
     speed = xp.sqrt((xp.asarray(state.qvel)[:, :2] ** 2).sum(axis=1))
     return state, (state.qpos[:, 2], speed, xp.asarray(state.foot_contact).mean(axis=1))
+
+
+def _summary(robot: Robot, qpos: np.ndarray, height: np.ndarray, speed: np.ndarray, feet: np.ndarray) -> dict[str, Any]:
+    alive = np.logical_and.accumulate(height > robot.fall_height, axis=0)
+    return {
+        "steps": len(height),
+        "alive": float(alive[-1].mean()),
+        "fallen_at": float(np.median(alive.sum(axis=0)) + 1),
+        "upside_down": float((1.0 - 2.0 * (qpos[:, 4] ** 2 + qpos[:, 5] ** 2) < 0.0).mean()),
+        "height_m": float(height[alive].mean()),
+        "speed_mps": float(speed[alive].mean()),
+        "feet_down": float(feet[alive].mean()),
+    }
 
 
 # Transfer -------------------------------------------------------------------------------------------------------------
@@ -351,7 +354,7 @@ def race(ants: tuple[Ant, ...], size: Size, say: Say) -> dict[str, Any]:
         for number in range(size.rounds):
             say(f"speed: round {number + 1} of {size.rounds}")
             for name in (*teams,)[:: 1 if number % 2 else -1]:
-                records[name].samples[number] = teams[name].sample(size.seconds)
+                _ask(teams, name, records[name], number, size.seconds, say)
     finally:
         for team in teams.values():
             team.close()
@@ -364,14 +367,19 @@ def race(ants: tuple[Ant, ...], size: Size, say: Say) -> dict[str, Any]:
 
 
 def _start(contestant: Contestant, teams: dict[str, Team], record: Record, say: Say) -> None:
-    import os
-    import sys
-
     try:
         teams[contestant.name] = Team(contestant, sys.executable, os.environ.copy())
     except ContestantFailed as failure:
         record.skipped = str(failure)
         say(f"skipping {contestant.name}: {failure}")
+
+
+def _ask(teams: dict[str, Team], name: str, record: Record, number: int, seconds: float, say: Say) -> None:
+    try:
+        record.samples[number] = teams[name].sample(seconds)
+    except ContestantFailed as failure:
+        say(f"going on without {name}: {failure}")
+        teams.pop(name).close()
 
 
 # Learning curves ------------------------------------------------------------------------------------------------------

@@ -35,6 +35,15 @@ def test_a_felt_inertia_shows_an_armature_and_a_mass():
     assert light["hip_inertia"] > 1.0  # almost nothing but its armature
 
 
+def test_pybullet_reads_the_same_ant():
+    pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'footwork[bullet]'")
+    theirs, ours = body(parity.REFERENCE), body(SHIPPED)
+    assert theirs["mass_kg"] == pytest.approx(ours["mass_kg"], rel=1e-3)
+    for part, limits in ours["limits_deg"].items():
+        assert theirs["limits_deg"][part] == pytest.approx(limits, abs=0.1)
+    assert theirs["ankle_inertia"] > 1.5 * ours["ankle_inertia"]  # docs/ant.md: its ankles are slower
+
+
 def test_without_torque_the_heavy_ant_drops_flat():
     """docs/ant.md: fallen at step 19."""
     figures = wander(SHIPPED, 30)["zero"]

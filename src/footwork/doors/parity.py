@@ -16,7 +16,7 @@ class Parity:
 
     to: Path = Path("parity")  # where parity.json, the pictures and PARITY.md are left
     quick: bool = False  # little of everything: minutes
-    states: int | None = None  # from which C and MJX each take a step; default: 10240, or 256 with --quick
+    states: int | None = None  # per arena, from which C and MJX each take a step; default: 10240, or 128 with --quick
     curves: Path | None = None  # a folder of runs: learning curves of walker/plain on each engine, and their transfer
 
 

@@ -184,11 +184,11 @@ def check_robot(robot: Robot) -> None:
         raise ValueError(f"engine bullet has PyBullet's own ant, robot 'heavy': {robot.name!r} differs in {other[0]}")
 
 
-def masses(robot: Robot) -> dict[str, float]:
-    """What :func:`footwork.physics.mjcf.masses` tells, of PyBullet's own ant."""
+def describe(robot: Robot) -> dict[str, dict[str, Any]]:
+    """What :func:`footwork.physics.mjcf.describe` tells, of PyBullet's own ant."""
     check_robot(robot)
     nowhere = {"walls": [], "wall_height": 0.0, "original_env": False}
-    return World({"control_dt": robot.control_dt, "torque": robot.hip_torque, **nowhere}).masses()
+    return World({"control_dt": robot.control_dt, "torque": robot.hip_torque, **nowhere}).describe()
 
 
 def _num_cores() -> int:
@@ -368,11 +368,16 @@ class World:
         self.touching = before if self._original else self._now
         self._floor_counts = True
 
-    def masses(self) -> dict[str, float]:
-        """Of the ant as PyBullet reads it, kg: all of it, the torso with its four stubs, one thigh, one shin."""
+    def describe(self) -> dict[str, dict[str, Any]]:
+        """Of the ant as PyBullet reads it, what :func:`footwork.physics.mjcf.describe` tells."""
         mass = [self._call("getDynamicsInfo", self._ant, link)[0] for link in range(-1, self._num_links)]
         thigh, shin = mass[1 + self._thigh], mass[1 + self._shins[0]]
-        return {"ant": sum(mass), "torso": sum(mass) - 4 * (thigh + shin), "thigh": thigh, "shin": shin}
+        torso = sum(mass) - 4 * (thigh + shin)
+        joints = [self._call("getJointInfo", self._ant, joint)[8:10] for joint in self._joints[:2]]
+        limits = {
+            part: np.degrees(found).round(3).tolist() for part, found in zip(("hip", "ankle"), joints, strict=True)
+        }
+        return {"mass_kg": {"ant": sum(mass), "torso": torso, "thigh": thigh, "shin": shin}, "limits_deg": limits}
 
     def qpos(self) -> list[float]:
         """Torso and joints; with ``original_env``, x and y are the mean over parts."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import resources
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,6 +16,7 @@ from footwork.types import NUM_FEET
 _PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 PAIR_HAS_FOOT = np.array([[foot in pair for foot in range(NUM_FEET)] for pair in _PAIRS], np.float32)
 
+_PARTS = {"torso": "torso", "thigh": "thigh_1", "shin": "shin_1"}
 WALL_COLOUR = (0.55, 0.57, 0.62, 1.0)
 
 
@@ -68,8 +70,9 @@ def build_model(robot: Robot, arena: Arena) -> mujoco.MjModel:
     return build_spec(robot, arena).compile()
 
 
-def masses(robot: Robot) -> dict[str, float]:
-    """Of the compiled ant, kg: all of it, the torso with its four stubs, one thigh, one shin."""
+def describe(robot: Robot) -> dict[str, dict[str, Any]]:
+    """Of the compiled ant: masses in kg (all of it, the torso with its stubs, one thigh, one shin), limits in deg."""
     model = build_model(robot, open_field())
-    of = {name: float(model.body(name).mass[0]) for name in ("torso", "thigh_1", "shin_1")}
-    return {"ant": float(model.body_mass.sum()), "torso": of["torso"], "thigh": of["thigh_1"], "shin": of["shin_1"]}
+    mass = {part: float(model.body(name).mass[0]) for part, name in _PARTS.items()}
+    limits = {part: np.degrees(model.joint(f"{part}_1").range).round(3).tolist() for part in ("hip", "ankle")}
+    return {"mass_kg": {"ant": float(model.body_mass.sum()), **mass}, "limits_deg": limits}

@@ -1,8 +1,8 @@
 """MuJoCo in JAX (MJX), behind the Physics protocol: many ants on a GPU (extra ``[mjx]``).
 
 The same model as :mod:`footwork.physics.batch` steps, and every step is a traceable function of arrays: a whole
-rollout is one compiled program, with no way back to the host in between. On a CPU that works, some hundred
-times slower than MuJoCo in C; it is how the tests know that it works.
+rollout is one compiled program, with no way back to the host in between. It runs on a CPU too, many times
+slower than MuJoCo in C; it is how the tests know that it works.
 """
 
 from __future__ import annotations

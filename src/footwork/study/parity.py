@@ -69,17 +69,16 @@ WALKERS = ("walker/plain", "walker/appropriate-bias", "walker/interleaved", "wal
 class Size:
     """How much is measured."""
 
-    states: int  # shared by C and MJX
+    states: int  # shared by C and MJX, in each of two arenas
     episode: int  # control steps of random torque
-    device_episode: int  # the same on MJX, which is slow on a CPU
     handover_ants: int  # per pair of directions
     walkers: int  # packaged rows, of WALKERS
     rounds: int
     seconds: float  # of a sample of speed
 
 
-FULL = Size(10_240, 1000, 300, 16, 4, 5, 3.0)
-QUICK = Size(256, 60, 20, 1, 1, 1, 0.5)
+FULL = Size(10_240, 1000, 16, 4, 5, 3.0)
+QUICK = Size(128, 60, 1, 1, 1, 0.5)
 
 
 @dataclass
@@ -129,17 +128,15 @@ class Parity:
     def _single_steps(self) -> None:
         if DEVICE not in self.ants:
             return
-        half = self.size.states // 2
         self.found["single_steps"] = {
-            arena.name: single_steps(arena, half, self.say) for arena in (ANT_WALKER.arena, DEFAULT_MAZE)
+            arena.name: single_steps(arena, self.size.states, self.say) for arena in (ANT_WALKER.arena, DEFAULT_MAZE)
         }
 
     def _statistics(self) -> None:
         self.found["statistics"] = {}
         for ant in self.ants:
-            steps = self.size.device_episode if ant == DEVICE else self.size.episode
-            self.say(f"{ant.name}: {', '.join(TORQUES)} torque, {steps} control steps each")
-            self.found["statistics"][ant.name] = wander(ant, steps)
+            self.say(f"{ant.name}: torques {'; '.join(TORQUES)}")
+            self.found["statistics"][ant.name] = wander(ant, self.size.episode)
 
     def _transfer(self) -> None:
         """Policies that were trained on one engine, handed over on each."""
@@ -177,16 +174,14 @@ def body(ant: Ant) -> dict[str, Any]:
     in the air, its joints in the middle of their ranges, and how fast the joint turns after it.
     """
     robot = ROBOTS[ant.robot]
-    weigh = getattr(import_module(f"footwork.physics.{ENGINES[ant.engine].module}"), "masses", mjcf.masses)
+    describe = getattr(import_module(f"footwork.physics.{ENGINES[ant.engine].module}"), "describe", mjcf.describe)
     share, torque = 0.02, np.array([robot.hip_torque, robot.ankle_torque])
     with closing(physics_for(ant.engine, robot, ANT_WALKER.arena, NUM_JOINTS, 1)) as physics:
         state = place(physics, in_the_air(robot))
         speed = np.diagonal(np.asarray(physics.step(state, share * np.eye(NUM_JOINTS)).qvel)[:, 6:])
     felt = share * np.tile(torque, 4) * robot.control_dt / speed
     return {
-        "mass_kg": weigh(robot),
-        "hip_range_deg": robot.hip_range_deg,
-        "ankle_range_deg": robot.ankle_range_deg,
+        **describe(robot),
         "hip_torque": robot.hip_torque,
         "ankle_torque": robot.ankle_torque,
         "hip_inertia": float(felt[::2].mean()),

@@ -55,16 +55,16 @@ def page(found: dict[str, Any]) -> str:
 def _bodies(found: dict[str, Any]) -> Iterable[str]:
     yield "## Masses, limits, and how heavy a joint feels"
     yield (
-        "Felt inertia is what the torque of one control step says, on one joint of an ant at rest in the air. The "
-        "torques are nominal: PyBullet's ankles turn with 1/√2 of theirs (docs/ant.md)."
+        "Masses and limits are read from the engine's own model. Felt inertia is what the torque of one control step "
+        "says, on one joint of an ant at rest in the air. The torques are nominal: PyBullet's ankles turn with 1/√2 of theirs (docs/ant.md)."
     )
     yield _table(
         "ant",
         {
             name: {
                 **{f"{part} (kg)": f"{mass:.2f}" for part, mass in figures["mass_kg"].items()},
-                "hips (°)": _range(figures["hip_range_deg"]),
-                "ankles (°)": _range(figures["ankle_range_deg"]),
+                "hips (°)": _range(figures["limits_deg"]["hip"]),
+                "ankles (°)": _range(figures["limits_deg"]["ankle"]),
                 "torque hip / ankle (N m)": f"{figures['hip_torque']:g} / {figures['ankle_torque']:g}",
                 "felt inertia hip / ankle (kg m²)": f"{figures['hip_inertia']:.2f} / {figures['ankle_inertia']:.2f}",
             }

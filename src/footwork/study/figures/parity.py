@@ -84,6 +84,7 @@ def _rates(ax: Any, speeds: dict[str, Any]) -> None:
         ax.barh(y, figures["steps_per_second"]["median"], color=_COLOURS[name])
     ax.set_yticks(range(len(speeds)), [*reversed(speeds)], fontsize=7)
     ax.set_xscale("log")
+    ax.xaxis.set_minor_formatter("")
 
 
 def _smoothed(step: np.ndarray, value: np.ndarray, points: int = 100) -> tuple[np.ndarray, np.ndarray]:

@@ -55,8 +55,9 @@ def page(found: dict[str, Any]) -> str:
 def _bodies(found: dict[str, Any]) -> Iterable[str]:
     yield "## Masses, limits, and how heavy a joint feels"
     yield (
-        "Masses and limits are read from the engine's own model. Felt inertia is what the torque of one control step "
-        "says, on one joint of an ant at rest in the air. The torques are nominal: PyBullet's ankles turn with 1/√2 of theirs (docs/ant.md)."
+        "Masses and limits are read from the engine's own model. Felt inertia is what the torque of one control "
+        "step says, on one joint of an ant at rest in the air. The torques are nominal: PyBullet's ankles turn "
+        "with 1/√2 of theirs (docs/ant.md)."
     )
     yield _table(
         "ant",

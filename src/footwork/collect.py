@@ -39,7 +39,7 @@ class Tally(NamedTuple):
 
 def start(env: Environment, key: Key) -> Carry:
     """A first episode in every row."""
-    state, obs = jax.jit(env.initial)(key) if env.physics.traceable else env.initial(key)
+    state, obs = env.initial(key)
     _, shape = jax.eval_shape(env.finish, state, key)
     zeros = {name: jnp.zeros(env.num_envs) for name in shape.terms}
     return Carry(state, obs, EpisodeSums(zeros, jnp.zeros(env.num_envs, jnp.int32)))
@@ -62,12 +62,20 @@ def collect(
         The carry, the transitions with axes [R, T, N / R, ...], and per-run episode
         statistics (see :func:`_episode_metrics`).
     """
+    run = _compiled_rollout if env.physics.traceable else _rollout
+    return run(env, policy, num_steps, params, carry, key)
+
+
+def _rollout(env: Environment, policy: Policy, num_steps: int, params: Params, carry: Carry, key: Key) -> Any:
     body = partial(_environment_step, env, policy, params, key)
     rollout = (carry.state, carry.obs)
     (state, obs), (transition, tally) = scan_over(env.physics)(body, rollout, np.arange(num_steps))
     num_runs = jax.tree.leaves(params)[0].shape[0]
     sums, transition, metrics = _summarise(num_runs, carry.sums, transition, tally)
     return Carry(state, obs, sums), transition, metrics
+
+
+_compiled_rollout = jax.jit(_rollout, static_argnums=(0, 1, 2))  # all steps in one program, on the engine's device
 
 
 def _environment_step(env: Environment, policy: Policy, params: Params, key: Key, rollout: Any, t: Any) -> Any:

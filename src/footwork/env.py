@@ -242,8 +242,18 @@ def step(env: Environment, state: Any, action: Array, key: Key) -> tuple[Any, Ti
     """One whole step of any environment."""
     begin_key, simulate_key, finish_key = split_phases(key)
     state = env.begin(state, action, begin_key)
-    state = env.simulate(state, simulate_key)
+    state = simulate(env, state, simulate_key)
     return env.finish(state, finish_key)
+
+
+def simulate(env: Environment, state: Any, key: Key) -> Any:
+    """``env.simulate``, from the host: one compiled call on a traceable engine, which then need not come back."""
+    return _compiled_simulate(env, state, key) if env.physics.traceable else env.simulate(state, key)
+
+
+@partial(jax.jit, static_argnums=0)
+def _compiled_simulate(env: Environment, state: Any, key: Key) -> Any:
+    return env.simulate(state, key)
 
 
 def host_scan(body: Any, carry: Any, xs: Any) -> tuple[Any, Any]:
@@ -258,3 +268,8 @@ def host_scan(body: Any, carry: Any, xs: Any) -> tuple[Any, Any]:
 def scan_over(physics: Physics) -> Any:
     """The loop that a body stepping ``physics`` runs under."""
     return jax.lax.scan if physics.traceable else host_scan
+
+
+def loop_over(physics: Physics, body: Any) -> Any:
+    """``body`` in that loop, as a function of carry and xs; on a traceable engine all of it is compiled, once."""
+    return jax.jit(partial(jax.lax.scan, body)) if physics.traceable else partial(host_scan, body)

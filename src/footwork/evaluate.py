@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from footwork.arena import DIRECTIONS, open_field
-from footwork.env import Env, Environment, split_phases
+from footwork.env import Env, Environment, loop_over, simulate, split_phases
 from footwork.learn.networks import Policy
 from footwork.options import Options, OptionsState, SubPolicies, task_state
 from footwork.physics import DEFAULT_ENGINE, physics_for
@@ -32,6 +32,7 @@ HANDOVER_STEPS = 300  # control steps of the second
 HANDOVER_SPEED = 0.5  # m/s along the second, over all its steps, from which a hand-over counts as a success
 _PATH_STEPS = 10  # control steps between two looks at a path that no master leads
 _SEGMENT = 25  # control steps between two looks
+_STRETCH = 100  # decisions at most between two looks whether all rows have ended, on a device
 _NUM_DIRECTIONS = len(DIRECTIONS)
 _UNIT = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)  # of the directions, world frame
 
@@ -100,25 +101,31 @@ class _Course(NamedTuple):
 
 def _play_out(experiment: Experiment, env: Environment, act: Any, key: Key) -> _Course:
     """Play until every row's episode has ended."""
-    stride = experiment.steps_per_decision
-    steps_per_look = 1 if experiment.is_master else _PATH_STEPS
+    num_decisions = math.ceil(experiment.task.episode_steps / experiment.steps_per_decision)
+    stretch = math.gcd(num_decisions, _STRETCH) if env.physics.traceable else 1  # of one length: it is compiled once
     state, obs = env.initial(jax.random.fold_in(key, 0))
-    kept, paths, ended = [], [_positions(state)], []
-    for i in range(math.ceil(experiment.task.episode_steps / stride)):
-        over = np.asarray(task_state(state).held)
-        if over.all():
+    start = _positions(state)
+    play = loop_over(env.physics, partial(_decision, env, act, key))
+    seen = []
+    for first in range(0, num_decisions, stretch):
+        if np.asarray(task_state(state).held).all():
             break
-        ended.append(over)
-        state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
-        state, step = finish_step(env, env.simulate(state, simulate_key), finish_key)
-        obs = step.obs
-        keep = (step.events, step.terms["progress"], action if experiment.is_master else ())
-        kept.append(jax.tree.map(np.asarray, keep))
-        if i % steps_per_look == 0:
-            paths.append(_positions(state))
-    events, progress, choices = jax.tree.map(lambda *leaves: np.stack(leaves), *kept)
+        (state, obs), kept = play((state, obs), np.arange(first + 1, first + 1 + stretch, dtype=np.int32))
+        seen.append(jax.tree.map(np.asarray, kept))
+    ended, positions, events, progress, choices = jax.tree.map(lambda *leaves: np.concatenate(leaves), *seen)
+    paths = np.concatenate([start[None], positions[:: 1 if experiment.is_master else _PATH_STEPS]])
     choices = choices if experiment.is_master else np.zeros((0, env.num_envs), np.int32)
-    return _Course(events, progress, choices, np.stack(ended), np.stack(paths))
+    return _Course(events, progress, choices, ended, paths)
+
+
+def _decision(env: Environment, act: Any, key: Key, playing: tuple[Any, Array], number: Array) -> tuple[Any, Any]:
+    """One decision of the policy under test, as the body of a loop, and what is kept of it."""
+    state, obs = playing
+    over = task_state(state).held
+    state, action, simulate_key, finish_key = act(state, obs, key, number)
+    state, step = finish_step(env, env.simulate(state, simulate_key), finish_key)
+    choice = action if isinstance(env, Options) else ()
+    return (state, step.obs), (over, task_state(state).physics.qpos[:, :2], step.events, step.terms["progress"], choice)
 
 
 def _summary(experiment: Experiment, course: _Course) -> Episodes:
@@ -260,8 +267,8 @@ class _Walk:
 
     def run(self, state: OptionsState, choice: np.ndarray, segment: int) -> tuple[OptionsState, Any]:
         """One segment: the state after it and what was counted."""
-        begin, simulate, finish = split_phases(jax.random.fold_in(self.key, 1 + segment))
-        state = self.env.simulate(self.env.begin(state, jnp.asarray(choice), begin), simulate)
+        begin, simulating, finish = split_phases(jax.random.fold_in(self.key, 1 + segment))
+        state = simulate(self.env, self.env.begin(state, jnp.asarray(choice), begin), simulating)
         state, step = finish_step(self.env, state, finish)
         return state, step.events
 

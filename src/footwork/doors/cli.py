@@ -17,7 +17,7 @@ import tyro
 
 from footwork.doors.commands.running import Evaluate, Export, List, Quickstart, Train, Transitions
 from footwork.doors.commands.seeing import Play, Replay, Video
-from footwork.doors.commands.studying import Bench, Figures, Report, Reproduce
+from footwork.doors.commands.studying import Bench, Figures, Parity, Report, Reproduce
 
 # In the order of ``footwork --help``.
 Command = (
@@ -34,6 +34,7 @@ Command = (
     | Reproduce
     | Figures
     | Report
+    | Parity
 )
 
 

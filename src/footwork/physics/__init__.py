@@ -27,6 +27,7 @@ class Engine(NamedTuple):
 
 ENGINES: dict[str, Engine] = {
     "mujoco": Engine("batch", "BatchPhysics", about="MuJoCo in C on a thread pool"),
+    "mjx": Engine("mjx", "MjxPhysics", "mujoco.mjx", "MuJoCo in JAX, for GPUs"),
     "bullet": Engine("bullet", "BulletPhysics", "pybullet", "PyBullet, the paper's engine"),
     "bullet-original": Engine("bullet", "OriginalEnvPhysics", "pybullet", "the same, seen as AntBulletEnv-v0 sees it"),
 }

@@ -9,12 +9,10 @@ import mujoco.batch
 import numpy as np
 
 from footwork.arena import Arena
-from footwork.physics.mjcf import build_model
+from footwork.physics.mjcf import PAIR_HAS_FOOT, build_model
 from footwork.robot import Robot
 from footwork.types import NUM_FEET, PhysicsState
 
-_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # the order of the feet_i_j sensors
-_PAIR_HAS_FOOT = np.array([[foot in pair for foot in range(NUM_FEET)] for pair in _PAIRS], np.float32)
 _FATAL_WARNINGS = [
     int(kind)
     for kind in (
@@ -151,7 +149,7 @@ class BatchPhysics:
             qpos=qpos,
             qvel=qvel,
             foot_contact=touching[:, :NUM_FEET],
-            foot_collision=np.minimum(touching[:, NUM_FEET:] @ _PAIR_HAS_FOOT, 1.0),
+            foot_collision=np.minimum(touching[:, NUM_FEET:] @ PAIR_HAS_FOOT, 1.0),
             diverged=~finite | (self._failed | warned)[simulation],
             engine=simulation,
         )

@@ -184,6 +184,13 @@ def check_robot(robot: Robot) -> None:
         raise ValueError(f"engine bullet has PyBullet's own ant, robot 'heavy': {robot.name!r} differs in {other[0]}")
 
 
+def describe(robot: Robot) -> dict[str, dict[str, Any]]:
+    """What :func:`footwork.physics.mjcf.describe` tells, of PyBullet's own ant."""
+    check_robot(robot)
+    nowhere = {"walls": [], "wall_height": 0.0, "original_env": False}
+    return World({"control_dt": robot.control_dt, "torque": robot.hip_torque, **nowhere}).describe()
+
+
 def _num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -361,6 +368,17 @@ class World:
         self.touching = before if self._original else self._now
         self._floor_counts = True
 
+    def describe(self) -> dict[str, dict[str, Any]]:
+        """Of the ant as PyBullet reads it, what :func:`footwork.physics.mjcf.describe` tells."""
+        mass = [self._call("getDynamicsInfo", self._ant, link)[0] for link in range(-1, self._num_links)]
+        thigh, shin = mass[1 + self._thigh], mass[1 + self._shins[0]]
+        torso = sum(mass) - 4 * (thigh + shin)
+        joints = [self._call("getJointInfo", self._ant, joint)[8:10] for joint in self._joints[:2]]
+        limits = {
+            part: np.degrees(found).round(3).tolist() for part, found in zip(("hip", "ankle"), joints, strict=True)
+        }
+        return {"mass_kg": {"ant": sum(mass), "torso": torso, "thigh": thigh, "shin": shin}, "limits_deg": limits}
+
     def qpos(self) -> list[float]:
         """Torso and joints; with ``original_env``, x and y are the mean over parts."""
         position, (x, y, z, w) = self._call("getBasePositionAndOrientation", self._ant)
@@ -416,6 +434,7 @@ class World:
         joints = {info[1].decode(): link for link, info in enumerate(names)}
         self._joints = [joints[name] for name in JOINT_NAMES]
         self._shins = [links[name] for name in SHIN_NAMES]
+        self._thigh = links["aux_1"]
         for link in range(self._num_links):  # no motor brakes a joint
             self._call(
                 "setJointMotorControl2",

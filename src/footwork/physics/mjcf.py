@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from importlib import resources
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from footwork.arena import Arena
+from footwork.arena import Arena, open_field
 from footwork.robot import ANKLE_SIGN, Robot
+from footwork.types import NUM_FEET
 
+# The contact sensors: floor_1 to floor_4, then feet_i_j in the order of these pairs.
+_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+PAIR_HAS_FOOT = np.array([[foot in pair for foot in range(NUM_FEET)] for pair in _PAIRS], np.float32)
+
+_PARTS = {"torso": "torso", "thigh": "thigh_1", "shin": "shin_1"}
 WALL_COLOUR = (0.55, 0.57, 0.62, 1.0)
 
 
@@ -61,3 +68,11 @@ def _write_joint(joint: mujoco.MjsJoint, robot: Robot) -> None:
 def build_model(robot: Robot, arena: Arena) -> mujoco.MjModel:
     """The compiled model."""
     return build_spec(robot, arena).compile()
+
+
+def describe(robot: Robot) -> dict[str, dict[str, Any]]:
+    """Of the compiled ant: masses in kg (all of it, the torso with its stubs, one thigh, one shin), limits in deg."""
+    model = build_model(robot, open_field())
+    mass = {part: float(model.body(name).mass[0]) for part, name in _PARTS.items()}
+    limits = {part: np.degrees(model.joint(f"{part}_1").range).round(3).tolist() for part in ("hip", "ankle")}
+    return {"mass_kg": {"ant": float(model.body_mass.sum()), **mass}, "limits_deg": limits}

@@ -23,12 +23,13 @@ import numpy as np
 from footwork.arena import DIRECTIONS, Arena, Wall
 from footwork.autoreset import AutoReset
 from footwork.collect import start
-from footwork.env import Env, Environment
+from footwork.env import Env, Environment, loop_over
 from footwork.learn.config import PAPER, PPOConfig
 from footwork.learn.networks import Policy
+from footwork.physics import physics_for
 from footwork.physics.batch import BatchPhysics
 from footwork.regularisers import directions_of_rows
-from footwork.robot import HEAVY
+from footwork.robot import HEAVY, ROBOTS
 from footwork.study.experiments import ANT_MAZE, ANT_WALKER, find_row
 from footwork.study.rivals import Measure, repeat, serve
 from footwork.study.runs import find_trained
@@ -69,6 +70,25 @@ def physics(rows: int, threads: int) -> Measure:
 
     repeat(control_step, 0.2)
     return lambda seconds: repeat(control_step, seconds)
+
+
+def engine(engine: str, robot: str, rows: int) -> Measure:
+    """An engine behind the Physics protocol, ten control steps at a time; ants are put back now and then."""
+    physics = physics_for(engine, ROBOTS[robot], ANT_WALKER.arena, rows)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (10, rows, 8)).astype(np.float32)
+    run = loop_over(physics, lambda state, action: (physics.step(state, action), None))
+    state, count = physics.initial(), 0
+
+    def ten_steps() -> float:
+        nonlocal state, count
+        state = physics.initial() if count % 20 == 0 else state
+        state, _ = run(state, actions)
+        jax.block_until_ready(state)
+        count += 1
+        return 10.0 * rows
+
+    ten_steps()
+    return lambda seconds: repeat(ten_steps, seconds)
 
 
 def walkers(runs: int, threads: int, rows: int = PAPER.num_envs) -> Measure:
@@ -265,7 +285,7 @@ def arrives(history: list[Metrics]) -> bool:
 
 
 KINDS: dict[str, Callable[..., Measure]] = {
-    function.__name__: function for function in (physics, walkers, maze_master, walls, update, learn)
+    function.__name__: function for function in (physics, engine, walkers, maze_master, walls, update, learn)
 }
 
 

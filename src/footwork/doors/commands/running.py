@@ -48,7 +48,7 @@ class Train:
 
     row: RowName  # its address, as `footwork list` shows it
     seeds: tuple[int, ...] = (0,)  # trained side by side in one batch
-    engine: str | None = None  # the physics: mujoco, bullet or bullet-original; ROW then means ENGINE/ROW
+    engine: str | None = None  # the physics: mujoco, mjx, bullet or bullet-original; ROW then means ENGINE/ROW
     robot: str | None = None  # another ant: heavy, bullet, stiff or light
     maze: str | None = None  # another maze: a name, or a text file of rows of # . r g
     runs: Path = Path("runs")  # where runs are kept
@@ -100,7 +100,7 @@ class Evaluate:
 
     row: RowName  # its address, as `footwork list` shows it, or the folder of a run
     runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
-    engine: str | None = None  # play on another physics than it was trained on: mujoco, bullet or bullet-original
+    engine: str | None = None  # play on another physics than it was trained on: mujoco, mjx, bullet or bullet-original
     episodes: int = 1000  # per seed
     seed: int = 1_000_003  # of the episodes
     deterministic: bool = False  # act by the mode of the distribution instead of a sample
@@ -131,7 +131,7 @@ class Transitions:
 
     row: RowName  # a walker row, or the folder of a run of one
     runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
-    engine: str | None = None  # play on another physics than it was trained on: mujoco, bullet or bullet-original
+    engine: str | None = None  # play on another physics than it was trained on: mujoco, mjx, bullet or bullet-original
     orthogonal: bool = False  # switch at right angles only
     ants: int = 256  # per period of switching, and a quarter of it per pair of the matrix
     seed: int = 1_000_003  # of the episodes

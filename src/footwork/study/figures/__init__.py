@@ -1,5 +1,6 @@
 """Figures, each drawn from files alone; the only package that imports matplotlib."""
 
+from footwork.study.figures.parity import curves_figure, parity_figure
 from footwork.study.figures.paths import learning_curve, paths_figure
 from footwork.study.figures.speed import bench_figure
 from footwork.study.figures.table import FIGURES, Drawn, Figure, draw_figures, find_figures
@@ -9,8 +10,10 @@ __all__ = [
     "Drawn",
     "Figure",
     "bench_figure",
+    "curves_figure",
     "draw_figures",
     "find_figures",
     "learning_curve",
+    "parity_figure",
     "paths_figure",
 ]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -10,10 +12,12 @@ import jax
 import numpy as np
 import pytest
 
+from footwork.arena import MAZES
 from footwork.doors import cli
-from footwork.doors.export import export
+from footwork.doors.export import _own_fields, export
 from footwork.doors.policies import load_policy, of_trained
 from footwork.record import RunError
+from footwork.study.experiments import find_row
 from footwork.study.runs import find_needed, find_trained
 
 NOWHERE = Path("nowhere")
@@ -105,6 +109,23 @@ def test_the_card_says_what_was_measured(exported):
     assert "2 episodes" in card
     assert "footwork train maze/hrl/plain --seeds" in card
     assert str(exported.parent) not in card + json.dumps(report)  # no path of this machine
+    named = set(re.findall(r"^\* .*$", card, re.MULTILINE))
+    for file in exported.iterdir():
+        assert file.name in ("README.md", "lock") or any(f"`{file.name}`" in line for line in named), file.name
+
+
+def test_the_card_names_the_fields_that_are_not_the_rows():
+    row = find_row("maze/hrl/plain")
+    assert _own_fields(replace(row, total_steps=7)) == ""
+    other = replace(row, option_steps=7, task=replace(row.task, arena=MAZES["spiral"]))
+    assert _own_fields(other) == "Other than the row's: `option_steps`, `task.arena`. "
+
+
+def test_an_export_shows_an_episode(exported):
+    page = (exported / "replay.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)[1])
+    assert [episode["row"] for episode in data["episodes"]] == ["maze/hrl/plain"]
+    assert not re.search(r"(src|href)=.https?:", page)
 
 
 def test_an_export_does_not_write_over_anything(exported):
@@ -214,6 +235,33 @@ def test_the_vec_env_refuses_other_reset_modes(vec_env):
         FootworkVecEnv(make_vector("footwork/AntWalker-v0", 2))
     with pytest.raises(ValueError, match="is not one of footwork/AntWalker-v0"):
         make_vector("CartPole-v1", 2)
+
+
+def test_staggered_rows_are_not_in_step_and_a_cut_is_a_truncation(vec_env):
+    from footwork.doors.sb3 import make_vec_env
+
+    rows, length = 24, 4
+    plain, staggered = (
+        make_vec_env("footwork/AntMaze-v0", rows, episode_steps=length, staggered=s) for s in (False, True)
+    )
+    for env in (plain, staggered):
+        env.seed(5)
+        env.reset()
+    first, ends = np.ones(rows, bool), []
+    for _ in range(3 * length):
+        obs, _, _, _ = plain.step(np.zeros((rows, 8), np.float32))
+        new_obs, _, done, infos = staggered.step(np.zeros((rows, 8), np.float32))
+        for row in np.flatnonzero(done):
+            assert infos[row]["TimeLimit.truncated"]
+            if first[row] and "episode" not in infos[row]:  # cut: the episode was the same so far
+                np.testing.assert_array_equal(infos[row]["terminal_observation"], obs[row])
+                assert not np.array_equal(new_obs[row], obs[row])
+            else:
+                assert infos[row]["episode"]["l"] == length
+        first &= ~done
+        ends.append(done)
+    assert all(0 < done.sum() < rows for done in ends[length:])  # phases are spread
+    assert (np.sum(ends[length : 2 * length], axis=0) == 1).all()
 
 
 @pytest.mark.parametrize("kind", ["master", "flat"])

@@ -48,6 +48,7 @@ def same(one, other):
         "import gymnasium, footwork",
         "import gymnasium.spaces\nimport footwork.arena\nimport gymnasium",
         "import gymnasium; gymnasium.spec",
+        "import footwork, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium",  # asked for only
     ],
 )
 def test_ids_are_known_whatever_is_imported_first_and_nothing_heavy_comes_along(code):
@@ -313,7 +314,7 @@ def test_bad_fields_are_refused_in_clear_words(name, fields, words):
 def test_unknown_ids_and_fields_are_named():
     with pytest.raises(gymnasium.error.NameNotFound, match="AntWalker"):
         gymnasium.make("footwork/AntWlker-v0")
-    with pytest.raises(TypeError, match="maze_mp"):
+    with pytest.raises(TypeError, match="AntMaze has no field 'maze_mp'; its fields: maze_map, goal, "):
         make("AntMaze-v0", maze_mp=U)
     with pytest.raises(ValueError, match="autoreset_mode must be one of"):
         make_vec("AntMaze-v0", 2, autoreset_mode="Never")

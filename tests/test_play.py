@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -27,9 +28,11 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from footwork.doors import live, play
+from footwork.doors import visit as visit_module
 from footwork.doors.cli import run
 from footwork.doors.live import Lesson
-from footwork.doors.play import House, Visit, open_server
+from footwork.doors.play import open_server
+from footwork.doors.visit import House, Visit
 from footwork.study.experiments import find_row
 from footwork.study.palette import DIRECTION_COLOURS, GOAL_COLOUR, rgb
 from footwork.study.runs import find_trained
@@ -212,6 +215,27 @@ def test_a_scene_tells_the_page_of_the_maze(visit):
     assert scene["ants"] == ["walker/symmetric-interleaved"]
 
 
+def test_ants_stand_on_the_engine_of_the_row(monkeypatch, heard):
+    asked, closed, make = [], [], live.physics_for
+
+    def physics_for(engine, *arguments):
+        asked.append(engine)
+        physics = make("mujoco", *arguments)
+        monkeypatch.setattr(physics, "close", lambda: closed.append(engine))
+        return physics
+
+    def on_bullet(row, runs):
+        trained = find_trained(row, runs)
+        return trained._replace(experiment=replace(trained.experiment, engine="bullet"))
+
+    monkeypatch.setattr(live, "physics_for", physics_for)
+    monkeypatch.setattr(visit_module, "find_trained", on_bullet)
+    visit = Visit(House(NOWHERE, ROW), heard.append)
+    assert visit.master_row().engine == "bullet"
+    visit.leave()
+    assert (asked, closed) == (["bullet"], ["bullet"])
+
+
 # ---------------------------------------------------------------- a lesson
 
 
@@ -374,6 +398,28 @@ def test_ctrl_c_closes_cleanly():
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert (process.returncode, out, err) == (0, "closing\n", "")
+
+
+def test_a_signal_before_the_server_serves_closes_it_too(monkeypatch):
+    """It may come between the line that tells the address and the loop."""
+
+    def interrupt(word, **_):
+        if word.startswith("http"):
+            signal.raise_signal(signal.SIGINT)
+
+    def give_up(*_):
+        raise AssertionError("the server was not closed")
+
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    monkeypatch.setattr("builtins.print", interrupt)
+    alarm = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(120)
+    try:
+        play.play(ROW, NOWHERE, "127.0.0.1", 0, 1)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, alarm)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
 # ---------------------------------------------------------------- in a browser

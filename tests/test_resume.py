@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -79,11 +78,11 @@ runs.train_row(tiny("walker/plain", {iterations}), (0,), Path({runs!r}), "seed-0
 def test_kill_minus_nine_loses_nothing(tmp_path):
     code = KILLED.format(tests=os.path.dirname(__file__), runs=str(tmp_path / "killed"), iterations=20 * KILLS)
     metrics = run_path(tmp_path / "killed", "walker/plain", (0,)) / "metrics.jsonl"
-    chance = random.Random(0)
+    chance = np.random.default_rng(0)
     kills, seen = 0, 0
     while kills < KILLS:
         process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-        deadline, enough = time.monotonic() + 120, seen + chance.randint(1, 10)
+        deadline, enough = time.monotonic() + 120, seen + int(chance.integers(1, 11))
         while process.poll() is None and time.monotonic() < deadline:
             lines = metrics.read_bytes().count(b"\n") if metrics.is_file() else 0
             if lines > enough:

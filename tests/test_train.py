@@ -270,6 +270,20 @@ def test_an_unfinished_run_is_no_address(tmp_path):
         find_trained(str(run.path), tmp_path)
 
 
+def test_places_that_are_no_runs_are_told_apart_from_unknown_rows(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    with pytest.raises(ValueError, match=r"run is a folder, but not of a run or an export: it has no config\.json"):
+        find_trained(str(run), tmp_path)
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(ValueError, match=r"notes\.txt is a file, and a row's name or the folder of a run is wanted$"):
+        find_trained(str(tmp_path / "notes.txt"), tmp_path)
+    (run / "config.json").write_text("{}")
+    (run / "policy.safetensors").write_text("")
+    with pytest.raises(ValueError, match=r"is wanted: name its folder, .*run$"):
+        find_trained(str(run / "policy.safetensors"), tmp_path)
+
+
 def test_unknown_and_untrained_rows_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"unknown row 'walker/fast'; known rows: walker/{plain, ") as caught:
         find_trained("walker/fast", tmp_path)

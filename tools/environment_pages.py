@@ -51,7 +51,6 @@ PAGES = {
     ),
 }
 
-MAZE_FIELDS = inspect.signature(settings.ant_maze).parameters
 HISTORY = {
     name: ["v0: first version. Ant `heavy`, calibrated against PyBullet's ([docs/ant.md](../ant.md))."]
     for name in PAGES
@@ -203,11 +202,11 @@ def info(setting):
 def fields_of(name):
     """Keyword arguments, their defaults and meanings, from the functions that read them."""
     make = PAGES[name][0]
-    meanings, parameters = arguments(make), dict(inspect.signature(make).parameters)
-    if parameters.pop("maze_fields", None) is not None:
+    meanings = arguments(make)
+    if make is settings.ant_maze_options:
         meanings = {**arguments(settings.ant_maze), **meanings}
-        parameters = {**parameters, **{k: v for k, v in MAZE_FIELDS.items() if k not in parameters}}
-    return [(f"`{key}`", f"`{parameter.default!r}`", meanings[key]) for key, parameter in parameters.items()]
+    known = settings.known_fields(name.split("-", maxsplit=1)[0])
+    return [(f"`{key}`", f"`{default!r}`", meanings[key]) for key, default in known.items()]
 
 
 def arguments(function):

@@ -13,39 +13,41 @@ when, and only if, somebody imports it.
 """
 
 import importlib
-import importlib.abc
-import importlib.machinery
-import importlib.util
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 __version__ = "0.1.0"
 
 
-class _AfterGymnasium(importlib.abc.MetaPathFinder):
-    """Finds nothing itself; has the environments registered once Gymnasium has been imported, and is gone.
+class _AfterGymnasium:
+    """A finder that finds nothing of its own: it has the environments registered once Gymnasium has been imported.
 
-    Gymnasium 1.4 has no entry points. Importing it here would cost every command 0.2 s, and
-    registering only if it has been imported already would hang on the order of two imports.
+    Why a hook, and not one of the plainer ways? Gymnasium 1 has no entry points for environments. Importing it here
+    would cost every command 0.2 s, ``footwork --help`` half of its time. Registering only where it has been imported
+    already would hang on the order of two imports, which linters sort. And an import of our own that users must
+    write (``import footwork.doors.gym``) is not "registered on import". The hook costs nothing until it is needed.
     """
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> importlib.machinery.ModuleSpec | None:
+    ) -> ModuleSpec | None:
         if fullname != "gymnasium":
             return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(fullname)
+        others = (finder for finder in sys.meta_path if finder is not self)
+        spec = next((found for finder in others if (found := finder.find_spec(fullname, path, target))), None)
         if spec is not None and spec.loader is not None:
-            run = spec.loader.exec_module
+            execute = spec.loader.exec_module
 
-            def run_and_register(module: ModuleType) -> None:
-                run(module)
+            def execute_and_register(module: ModuleType) -> None:
+                execute(module)
+                if self in sys.meta_path:  # here and not above: whoever only asks for a spec has not imported it
+                    sys.meta_path.remove(self)
                 _register()
 
-            spec.loader.exec_module = run_and_register  # type: ignore[method-assign]
+            spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
         return spec
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +16,12 @@ import numpy as np
 from footwork.arena import DIRECTIONS, open_field
 from footwork.env import Env, Environment, loop_over, simulate, split_phases
 from footwork.learn.networks import Policy
-from footwork.options import Options, OptionsState, SubPolicies
+from footwork.options import Options, OptionsState, SubPolicies, task_state
 from footwork.physics import DEFAULT_ENGINE, physics_for
 from footwork.regularisers import directions_of_rows
 from footwork.statistics import mean_over_seeds, rate_over_seeds
 from footwork.tasks.task import SUCCESS_RADII, Task
-from footwork.train import Experiment, Trained
+from footwork.train import Experiment, Trained, choices_of
 from footwork.types import Array, Key, Params
 
 IDLE_SPEED = 0.2  # m/s; an option slower than this has not moved the ant
@@ -30,8 +30,9 @@ SWITCHING_PERIODS = (25, 50, 100, 200)  # control steps per option
 HANDOVER_AFTER = (100, 200)  # control steps of the first policy, uniform in this range in multiples of the segment
 HANDOVER_STEPS = 300  # control steps of the second
 HANDOVER_SPEED = 0.5  # m/s along the second, over all its steps, from which a hand-over counts as a success
-_SEGMENT = 25  # control steps between two looks
 _STRETCH = 100  # decisions at most between two looks whether all rows have ended, on a device
+_PATH_STEPS = 10  # control steps between two looks at a path that no master leads
+_SEGMENT = 25  # control steps between two looks
 _NUM_DIRECTIONS = len(DIRECTIONS)
 _UNIT = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)  # of the directions, world frame
 
@@ -42,8 +43,8 @@ Report = Callable[[str], None]
 class Episodes:
     """One episode per row, and what its path was.
 
-    All arrays have a leading row axis; ``paths`` is [decisions + 1, N, 2] in m and
-    ``choices`` [decisions, N], of master rows only.
+    All arrays have a leading row axis; ``paths`` is [looks, N, 2] in m, at the start and after each
+    decision of a master, every tenth of others, and ``choices`` [decisions, N], of master rows only.
     """
 
     closest: np.ndarray  # m, to the goal
@@ -81,63 +82,81 @@ def play_episodes(
     num_threads: int = 0,
 ) -> Episodes:
     """Play ``num_episodes`` episodes of one seed's policy, all at once."""
-    experiment = trained.experiment
-    env = evaluation_environment(experiment, num_episodes, sub_policies, num_threads)
+    env = evaluation_environment(trained.experiment, num_episodes, sub_policies, num_threads)
     act = actor(trained, seed_index, env, deterministic)
-    stride = experiment.option_steps if experiment.is_master else 1
-    num_decisions = math.ceil(experiment.task.episode_steps / stride)
-    key = jax.random.key(seed)
-    state, obs = env.initial(jax.random.fold_in(key, 0))
-    goal_radius, dt = experiment.task.goal_radius or 0.0, stride * experiment.task.robot.control_dt
-    play = loop_over(env.physics, partial(_decision, env, act, key))
-    stretch = math.gcd(num_decisions, _STRETCH) if env.physics.traceable else 1  # of one length: it is compiled once
-    seen, start = [], _positions(state)
     with closing(env.physics):
-        for first in range(0, num_decisions, stretch):
-            if np.asarray(_inner(state).held).all():
-                break
-            (state, obs), kept = play((state, obs), np.arange(first + 1, first + 1 + stretch, dtype=np.int32))
-            seen.append(jax.tree.map(np.asarray, kept))
-    over, positions, events, progress, choices = jax.tree.map(lambda *leaves: np.concatenate(leaves), *seen)
-    paths = np.concatenate([start[None], positions[:: 1 if experiment.is_master else 10]])
-    counts = lambda name: (events[name] & ~over).any(axis=0)  # noqa: E731
-    distance = np.where(over, np.inf, events["goal_distance"])
-    arrival = np.where((distance <= goal_radius).any(axis=0), (distance <= goal_radius).argmax(axis=0) + 1.0, np.nan)
-    return Episodes(
-        closest=distance.min(axis=0),
-        fallen=counts("fallen"),
-        flipped=counts("flipped"),
-        progress=progress.sum(axis=0) * experiment.task.robot.control_dt,
-        distance=progress.sum(axis=0),
-        time_to_goal=arrival * dt,
-        paths=paths,
-        choices=choices if experiment.is_master else np.zeros((0, num_episodes), np.int32),
-        ended=over,
-    )
+        course = _play_out(trained.experiment, env, act, jax.random.key(seed))
+    return _summary(trained.experiment, course)
 
 
-def _decision(env: Environment, act: Any, key: Key, playing: tuple[Any, Array], number: Array) -> tuple[Any, Any]:
+class _Course(NamedTuple):
+    """Episodes as they went: what is kept of each decision of the policy, [decisions, N]."""
+
+    events: dict[str, np.ndarray]
+    progress: np.ndarray
+    choices: np.ndarray  # of master rows; else no decisions
+    ended: np.ndarray  # before the decision
+    paths: np.ndarray  # [looks, N, 2] in m
+
+
+def _play_out(experiment: Experiment, env: Environment, act: Any, key: Key) -> _Course:
+    """Play until every row's episode has ended."""
+    num_decisions = math.ceil(experiment.task.episode_steps / experiment.steps_per_decision)
+    play = loop_over(env.physics, partial(_decide, env, act, key))
+    stretch = math.gcd(num_decisions, _STRETCH) if env.physics.traceable else 1  # of one length: it is compiled once
+    playing, kept = env.initial(jax.random.fold_in(key, 0)), []
+    start = _positions(playing[0])
+    for first in range(1, 1 + num_decisions, stretch):
+        if np.asarray(task_state(playing[0]).held).all():
+            break
+        playing, stretch_kept = play(playing, np.arange(first, first + stretch, dtype=np.int32))
+        kept.append(jax.tree.map(np.asarray, stretch_kept))
+    ended, positions, events, progress, choices = jax.tree.map(lambda *leaves: np.concatenate(leaves), *kept)
+    choices = choices if experiment.is_master else np.zeros((0, env.num_envs), np.int32)
+    steps_per_look = 1 if experiment.is_master else _PATH_STEPS
+    return _Course(events, progress, choices, ended, np.concatenate([start[None], positions[::steps_per_look]]))
+
+
+def _decide(env: Environment, act: Any, key: Key, playing: tuple[Any, Array], number: Array) -> tuple[Any, Any]:
     """One decision of the policy under test, as the body of a loop, and what is kept of it."""
     state, obs = playing
-    over = _inner(state).held
+    ended = task_state(state).held
     state, action, simulate_key, finish_key = act(state, obs, key, number)
-    state = env.simulate(state, simulate_key)
-    state, step = finish_step(env, state, finish_key)
+    state, step = finish_step(env, env.simulate(state, simulate_key), finish_key)
     choice = action if isinstance(env, Options) else ()
-    return (state, step.obs), (over, _inner(state).physics.qpos[:, :2], step.events, step.terms["progress"], choice)
+    kept = (ended, task_state(state).physics.qpos[:, :2], step.events, step.terms["progress"], choice)
+    return (state, step.obs), kept
+
+
+def _summary(experiment: Experiment, course: _Course) -> Episodes:
+    """What the episodes came to; a decision after a row's end counts for nothing."""
+    dt = experiment.task.robot.control_dt
+    distance = np.where(course.ended, np.inf, course.events["goal_distance"])
+    arrived = distance <= (experiment.task.goal_radius or 0.0)
+    decisions = np.where(arrived.any(axis=0), arrived.argmax(axis=0) + 1.0, np.nan)
+    progress = course.progress.sum(axis=0)
+    return Episodes(
+        closest=distance.min(axis=0),
+        fallen=(course.events["fallen"] & ~course.ended).any(axis=0),
+        flipped=(course.events["flipped"] & ~course.ended).any(axis=0),
+        progress=progress * dt,
+        distance=progress,
+        time_to_goal=decisions * (experiment.steps_per_decision * dt),
+        paths=course.paths,
+        choices=course.choices,
+        ended=course.ended,
+    )
 
 
 def actor(trained: Trained, seed_index: int, env: Environment, deterministic: bool) -> Any:
     """The jitted first call of a step: the policy under test, and the environment's begin."""
-    params = jax.tree.map(lambda leaf: leaf[seed_index], trained.params)
     experiment = trained.experiment
     if experiment.is_walker:
         walkers = trained.sub_policies(seed_index, deterministic)
         direction = jnp.array(env.goal_index)  # type: ignore[attr-defined]
         choose: Any = lambda obs, key: walkers.act(obs, direction, key)  # noqa: E731
     else:
-        single = jax.tree.map(lambda leaf: leaf[0], params)
-        choose = partial(_choose, experiment.policy(), single, deterministic)
+        choose = partial(_choose, experiment.policy(), trained.single(seed_index), deterministic)
 
     @jax.jit
     def act(state: Any, obs: Array, key: Key, i: Array) -> Any:
@@ -159,12 +178,8 @@ def finish_step(env: Environment, state: Any, key: Key) -> Any:
     return env.finish(state, key)
 
 
-def _inner(state: Any) -> Any:
-    return state.inner if isinstance(state, OptionsState) else state
-
-
 def _positions(state: Any) -> np.ndarray:
-    return np.asarray(_inner(state).physics.qpos)[:, :2].copy()
+    return np.asarray(task_state(state).physics.qpos)[:, :2].copy()
 
 
 def evaluate(
@@ -182,12 +197,11 @@ def evaluate(
     The intervals are over seeds and episodes (:mod:`footwork.statistics`); one seed says nothing about others.
     """
     experiment = trained.experiment
-    episodes = []
-    for index in range(len(trained.seeds)):
-        subs = None
-        if experiment.is_master and needed is not None:
-            subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
-        episodes.append(play_episodes(trained, subs, num_episodes, seed + index, index, deterministic, num_threads))
+    subs = choices_of(experiment, needed)
+    episodes = [
+        play_episodes(trained, subs, num_episodes, seed + index, index, deterministic, num_threads)
+        for index in range(len(trained.seeds))
+    ]
     closest, fallen, flipped, progress = (
         np.stack([getattr(e, name) for e in episodes]) for name in ("closest", "fallen", "flipped", "progress")
     )

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from footwork.env import Environment, EnvState
+from footwork.env import Environment
 from footwork.evaluate import actor, evaluation_environment, finish_step
 from footwork.learn.networks import Policy
-from footwork.options import Options, OptionsState, SubPolicies
+from footwork.options import Options, SubPolicies, task_state
 from footwork.tasks.task import Task
 from footwork.train import Trained
 from footwork.types import Array, Key, Params, TimeStep
@@ -45,7 +45,7 @@ class Footage:
         odds: [decisions, 4] float32, the master's probabilities; no rows where there is no master.
         value: [decisions] float32, the master's estimate; empty also where its critic was not packaged.
         option_steps: control steps per decision.
-        outcome: reached, fallen, flipped, diverged or truncated.
+        outcome: reached, fallen, flipped, diverged, truncated (time was up), or cut: filmed no further.
     """
 
     row: str
@@ -116,7 +116,7 @@ def film(
     experiment = trained.experiment
     env = evaluation_environment(experiment, num_episodes, sub_policies, num_threads)
     act = actor(trained, seed_index, env, deterministic)
-    stride = experiment.option_steps if experiment.is_master else 1
+    stride = experiment.steps_per_decision
     wanted = experiment.task.episode_steps if most_steps is None else min(most_steps, experiment.task.episode_steps)
     key = jax.random.key(seed)
     state, obs = env.initial(jax.random.fold_in(key, 0))
@@ -127,7 +127,7 @@ def film(
         if np.asarray(task_state(state).held).all():
             break
         if experiment.is_master:
-            opinions.append(opinion(experiment.policy(), _single(trained, seed_index), obs))
+            opinions.append(opinion(experiment.policy(), trained.single(seed_index), obs))
         state, action, simulate_key, finish_key = act(state, obs, key, np.int32(i + 1))
         choice = _choice(trained, env, action)
         over = np.asarray(task_state(state).held)
@@ -150,20 +150,11 @@ def control_steps(env: Environment, state: Any, simulate_key: Key, finish_key: K
         yield state, state.total
 
 
-def task_state(state: Any) -> EnvState:
-    """The state of the task, below an option."""
-    return state.inner if isinstance(state, OptionsState) else state
-
-
 @partial(jax.jit, static_argnums=0)
 def opinion(policy: Policy, params: Params, obs: Array) -> tuple[Array, Array]:
     """A master's probabilities [N, 4], and its value [N], NaN without a critic."""
     odds = jax.nn.softmax(policy.outputs(params, obs))
     return odds, policy.value(params, obs) if "critic" in params else odds[:, 0] * np.nan
-
-
-def _single(trained: Trained, seed_index: int) -> Params:
-    return jax.tree.map(lambda leaf: leaf[seed_index, 0], trained.params)
 
 
 def _choice(trained: Trained, env: Environment, action: Array) -> np.ndarray:
@@ -187,7 +178,7 @@ def _cut(
     experiment = trained.experiment
     length = int((~frames.over[:, n]).sum())
     row = jax.tree.map(lambda leaf: leaf[:length, n], frames)
-    stride = experiment.option_steps if experiment.is_master else 1
+    stride = experiment.steps_per_decision
     decisions = math.ceil(length / stride)
     odds, value = np.zeros((0, 4), np.float32), np.zeros(0, np.float32)
     if opinions:
@@ -208,17 +199,17 @@ def _cut(
         odds=odds,
         value=value,
         option_steps=stride,
-        outcome=_outcome(row),
+        outcome=_outcome(row, length >= experiment.task.episode_steps),
     )
 
 
-def _outcome(row: _Frame) -> str:
+def _outcome(row: _Frame, whole: bool) -> str:
     if not row.terminated[-1]:
-        return "truncated"
+        return "truncated" if whole else "cut"
     for name in ("reached", "diverged", "flipped", "fallen"):
         if row.events[name][-1]:
             return name
     return "truncated"
 
 
-__all__ = ["NOBODY", "Footage", "control_steps", "film", "opinion", "task_state"]
+__all__ = ["NOBODY", "Footage", "control_steps", "film", "opinion"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -63,6 +63,11 @@ class OptionsState(NamedTuple):
     obs: Float[Array, "N D"]
     choice: Int[Array, " N"]
     total: TimeStep  # what the option has brought so far
+
+
+def task_state(state: Any) -> EnvState:
+    """The state of the task, below an option if there is one."""
+    return state.inner if isinstance(state, OptionsState) else state
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,6 +92,11 @@ class Experiment:
         return self.sub_policies is not None
 
     @property
+    def steps_per_decision(self) -> int:
+        """Control steps per action of its policy: a master's k, else one."""
+        return self.option_steps if self.is_master else 1
+
+    @property
     def runs_per_seed(self) -> int:
         """Learners side by side for one seed."""
         return len(DIRECTIONS) if self.is_walker and not self.symmetric else 1
@@ -125,6 +130,10 @@ class Trained(NamedTuple):
             params = jax.tree.map(lambda leaf: leaf[0], params)
         return SubPolicies(self.experiment.policy(), params, self.experiment.symmetric, deterministic)
 
+    def single(self, seed_index: int = 0) -> Params:
+        """One seed's parameters without leading axes, of rows that train one policy per seed: a master, a flat one."""
+        return jax.tree.map(lambda leaf: leaf[seed_index, 0], self.params)
+
 
 class Learning(NamedTuple):
     """All that changes while a run learns."""
@@ -142,6 +151,18 @@ class Interrupted(RuntimeError):
     """The run was asked to stop, and has saved itself."""
 
 
+def choices_of(experiment: Experiment, needed: Trained | None) -> SubPolicies | None:
+    """The sub-policies that a master chooses among, acting as its row says; None for other rows.
+
+    Args:
+        experiment: the row.
+        needed: the policies of ``experiment.needs``.
+    """
+    if needed is None or not experiment.is_master:
+        return None
+    return needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
+
+
 def build_environment(
     experiment: Experiment, num_seeds: int, needed: Trained | None, num_threads: int = 0
 ) -> AutoReset:
@@ -153,10 +174,8 @@ def build_environment(
         raise ValueError(f"{experiment.name} needs the policies of {experiment.needs}")
     if not experiment.is_walker:
         env = Env(task, physics, staggered=True)
-        if needed is None:
-            return AutoReset(env)
-        subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
-        return AutoReset(Options(env, subs, experiment.option_steps))
+        subs = choices_of(experiment, needed)
+        return AutoReset(env if subs is None else Options(env, subs, experiment.option_steps))
     directions = directions_of_rows(num_envs // num_seeds, range(len(DIRECTIONS))) * num_seeds
     walker = Env(task, physics, directions, staggered=True)
     partners = None if needed is None else needed.sub_policies()
@@ -165,7 +184,7 @@ def build_environment(
 
 def steps_per_iteration(experiment: Experiment) -> int:
     """Control steps that one run takes between updates."""
-    return experiment.ppo.batch_size * (experiment.option_steps if experiment.is_master else 1)
+    return experiment.ppo.batch_size * experiment.steps_per_decision
 
 
 def planned_steps(experiment: Experiment) -> int:
@@ -285,21 +304,41 @@ def train(
     """
     env = build_environment(experiment, len(seeds), needed, num_threads)
     compiling = compile_aside(experiment, len(seeds) * experiment.runs_per_seed)
-    learning = _resume(run, env, begin_learning(experiment, env, seeds))
-    per_iteration = steps_per_iteration(experiment)
-    total = planned_steps(experiment)
-    num_iterations = total // per_iteration
-    if learning.iteration > num_iterations:
-        at = learning.iteration * per_iteration
+    with closing(env.physics):
+        learning = _resume(run, env, begin_learning(experiment, env, seeds))
+        _check_not_beyond(experiment, run, learning)
+        learning = _learn(experiment, env, learning, seeds, run, compiling, checkpoint_seconds, tensorboard)
+        total = planned_steps(experiment)
+        _save(run, env, learning, total)
+    return _finish(experiment, seeds, run, learning, total)
+
+
+def _check_not_beyond(experiment: Experiment, run: RunDir, learning: Learning) -> None:
+    """Refuse to go on with a run that has taken more steps than it is asked for."""
+    at, total = learning.iteration * steps_per_iteration(experiment), planned_steps(experiment)
+    if at > total:
         raise ValueError(f"{run.path} is at step {at} already: total_steps must be at least that, got {total}")
-    last_save = time.monotonic()
+
+
+def _learn(
+    experiment: Experiment,
+    env: Environment,
+    learning: Learning,
+    seeds: tuple[int, ...],
+    run: RunDir,
+    compiling: Future[None],
+    checkpoint_seconds: float,
+    tensorboard: bool,
+) -> Learning:
+    """Iterate to the last planned step: what was learned. Logs every iteration, saves now and then and when stopped."""
+    per_iteration, total = steps_per_iteration(experiment), planned_steps(experiment)
+    step, last_save = learning.iteration * per_iteration, time.monotonic()
     with (
-        closing(env.physics),
         run.open_metrics(tensorboard) as log,
-        Progress(total, experiment.name, initial_step=learning.iteration * per_iteration) as progress,
+        Progress(total, experiment.name, initial_step=step) as progress,
         _stop_signals() as stop_asked,
     ):
-        while learning.iteration < num_iterations:
+        while step < total:
             begun = time.monotonic()
             learning, metrics = iterate(experiment, env, learning, seeds[0], compiling)
             step = learning.iteration * per_iteration
@@ -312,12 +351,12 @@ def train(
                 _save(run, env, learning, step)
                 last_save = time.monotonic()
             if stop_asked():
-                how = (
-                    "go on with --resume" if env.physics.resumable else f"but engine {experiment.engine} cannot resume"
-                )
-                raise Interrupted(f"stopped at step {step} of {total}; saved in {run.path}, {how}")
-    _save(run, env, learning, total)
-    return _finish(experiment, seeds, run, learning, total)
+                raise Interrupted(f"stopped at step {step} of {total}; saved in {run.path}, {_way_on(experiment, env)}")
+    return learning
+
+
+def _way_on(experiment: Experiment, env: Environment) -> str:
+    return "go on with --resume" if env.physics.resumable else f"but engine {experiment.engine} cannot resume"
 
 
 def _finish(experiment: Experiment, seeds: tuple[int, ...], run: RunDir, learning: Learning, step: int) -> Trained:

@@ -1,4 +1,4 @@
-"""Policies out: a folder of weights, config and a model card with figures measured now.
+"""Policies out: a folder of weights, config, a replay, and a model card with figures measured now.
 
 The folder is a finished run like any other, so that it is accepted wherever a row is.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,23 @@ from typing import Any
 from footwork import checkpoint
 from footwork.arena import DIRECTIONS
 from footwork.checkpoint import write_atomically
+from footwork.doors.replay import Replay, film_trained
 from footwork.evaluate import evaluate
 from footwork.record import RunDir, config_to_json
+from footwork.study.experiments import find_row, is_row
 from footwork.study.runs import NEEDED, PACKAGED, find_needed, find_trained, packaged
 from footwork.tasks.task import SUCCESS_RADII
-from footwork.train import Trained
+from footwork.train import Experiment, Trained
 
-Addition = Callable[[Trained, Trained | None, Path], Sequence[Path]]
+REPLAY = "replay.html"
+_HEADER = (  # as model hubs read it
+    "---",
+    "library_name: footwork",
+    "license: mit",
+    "tags: [reinforcement-learning, hierarchical-reinforcement-learning, locomotion, mujoco, gymnasium]",
+    "---",
+    "",
+)
 
 
 def export(
@@ -32,7 +41,6 @@ def export(
     seed: int = 1_000_003,
     num_threads: int = 0,
     onnx: bool = False,
-    additions: Sequence[Addition] = (),
 ) -> Path:
     """Write what an address means into the folder ``to``; returns the model card.
 
@@ -44,7 +52,6 @@ def export(
         seed: of the episodes.
         num_threads: of the physics; changes no number.
         onnx: also write ONNX files, those of the first seed.
-        additions: each adds files to the folder, such as a replay, and returns their paths.
 
     Raises:
         ValueError: the address is unknown.
@@ -63,8 +70,8 @@ def export(
         if needed is not None:
             checkpoint.save(to / NEEDED, needed.params, _meta(needed))
         files: list[Path] = list(write_onnx(trained, to)) if onnx else []
-        for add in additions:
-            files += add(trained, needed, to)
+        shown = film_trained(trained, needed, 1, seed, num_threads=num_threads)
+        Replay(tuple(shown), f"Footwork: {trained.experiment.name}").save(to / REPLAY)
         report = evaluate(trained, needed, episodes, seed, num_threads=num_threads)
         report["source"] = trained.experiment.name  # not where it lay on this machine
         write_atomically(to / "evaluation.json", json.dumps(report, indent=2).encode() + b"\n")
@@ -94,37 +101,15 @@ def _card(
     to: Path,
 ) -> str:
     """The model card."""
-    experiment, versions = trained.experiment, meta["versions"]
-    kind = "A master" if experiment.is_master else "Sub-policies" if experiment.is_walker else "A flat policy"
-    batch = list(meta.get("batch", trained.seeds))
-    seeds = " ".join(map(str, batch))
-    arena, robot = experiment.task.arena.name, experiment.task.robot.name
-    stands = (
-        ""
-        if needed is None
-        else (
-            f" It chooses every {experiment.option_steps} control steps among the sub-policies of "
-            f"`{needed.experiment.name}`, which are in this folder too."
-        )
-    )
     lines = [
-        "---",
-        "library_name: footwork",
-        "license: mit",
-        "tags: [reinforcement-learning, hierarchical-reinforcement-learning, locomotion, mujoco, gymnasium]",
-        "---",
+        *_HEADER,
+        f"# {trained.experiment.name}",
         "",
-        f"# {experiment.name}",
-        "",
-        f"{kind} for {experiment.task.name} in arena `{arena}`, ant `{robot}`.{stands}",
+        _what_it_is(trained.experiment, needed),
         "",
         "## How it was trained",
         "",
-        f"`footwork train {experiment.name} --seeds {seeds}`, {meta['steps']:,} control steps per run"
-        + ("" if batch == list(trained.seeds) else f"; this is seed {', '.join(map(str, trained.seeds))}")
-        + ", with "
-        + ", ".join(f"{name} {versions[name]}" for name in ("footwork", "jax", "mujoco"))
-        + ". `config.json` holds every field, those changed on the command line too.",
+        _how_it_was_trained(trained, meta),
         "",
         "## What it does",
         "",
@@ -139,6 +124,7 @@ def _card(
         "* `policy.safetensors`: parameters with leading axes [seed, policy of that seed]; no pickle",
         *([f"* `{NEEDED}`: the sub-policies it stands on"] if needed else []),
         "* `config.json`, `evaluation.json`, `DONE`: the run, its figures, its end",
+        f"* `{REPLAY}`: an episode in 3-D, of sub-policies one in each direction; opens in a browser, fetches nothing",
         *(f"* `{path.relative_to(to)}`" for path in files),
         "",
         "## Limits",
@@ -146,6 +132,44 @@ def _card(
         "Trained and measured in simulation, on one kind of ant and in one arena. It knows nothing of another.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _what_it_is(experiment: Experiment, needed: Trained | None) -> str:
+    kind = "A master" if experiment.is_master else "Sub-policies" if experiment.is_walker else "A flat policy"
+    task = experiment.task
+    said = f"{kind} for {task.name} in arena `{task.arena.name}`, ant `{task.robot.name}`."
+    if needed is None:
+        return said
+    return (
+        f"{said} It chooses every {experiment.option_steps} control steps among the sub-policies of "
+        f"`{needed.experiment.name}`, which are in this folder too."
+    )
+
+
+def _how_it_was_trained(trained: Trained, meta: dict[str, Any]) -> str:
+    experiment, versions = trained.experiment, meta["versions"]
+    batch = list(meta.get("batch", trained.seeds))
+    seeds = " ".join(map(str, batch))
+    which = "" if batch == list(trained.seeds) else f"; this is seed {', '.join(map(str, trained.seeds))}"
+    tools = ", ".join(f"{name} {versions[name]}" for name in ("footwork", "jax", "mujoco"))
+    return (
+        f"`footwork train {experiment.name} --seeds {seeds}`, {meta['steps']:,} control steps per run{which}, with "
+        f"{tools}. {_own_fields(experiment)}`config.json` holds every field."
+    )
+
+
+def _own_fields(experiment: Experiment) -> str:
+    """Which fields are not those of the row of that name, as a sentence; nothing where all are."""
+    if not is_row(experiment.name):
+        return ""
+    own, row = config_to_json(experiment), config_to_json(find_row(experiment.name))
+    names = []
+    for name in own.keys() - {"total_steps"}:  # the length is told beside
+        if isinstance(own[name], dict) and isinstance(row[name], dict):
+            names += [f"{name}.{part}" for part, value in own[name].items() if value != row[name].get(part)]
+        elif own[name] != row[name]:
+            names.append(name)
+    return f"Other than the row's: {', '.join(f'`{name}`' for name in sorted(names))}. " if names else ""
 
 
 def _figures(report: dict[str, Any], seed: int) -> list[str]:
@@ -172,8 +196,9 @@ def _figures(report: dict[str, Any], seed: int) -> list[str]:
     if report["time_to_goal_s"] is not None:
         rows.append(("time to the goal", f"{report['time_to_goal_s']:.1f} s"))
     seeds = ", ".join(map(str, report["seeds"]))
+    over = "episodes" if len(report["seeds"]) == 1 else "seeds and episodes"
     said = f"{report['episodes']} episodes (policy of seed {seeds}; episodes from seed {seed}), sampled actions, 95 %"
-    said += " intervals over episodes:"
+    said += f" intervals over {over}:"
     return [said, "", "| | |", "|---|---|", *(f"| {what} | {figure} |" for what, figure in rows)]
 
 

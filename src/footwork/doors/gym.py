@@ -57,7 +57,7 @@ def register() -> None:
 class _Offered:
     """What single and vector environments have in common: a setting, and the rows that play it."""
 
-    kind: ClassVar[str]  # the function of footwork.doors.settings that reads the keyword arguments
+    kind: ClassVar[str]  # one of footwork.doors.settings.MAKERS, which say what the keyword arguments mean
 
     def _offer(self, num_envs: int, num_threads: int, render_mode: str | None, fields: dict[str, Any]) -> None:
         from footwork.doors import settings
@@ -66,7 +66,7 @@ class _Offered:
             raise ValueError(f"render_mode must be human, rgb_array or None, got {render_mode!r}")
         if render_mode == "human" and not _has_screen():
             raise ValueError("render_mode 'human' needs a screen, and there is none here: use 'rgb_array'")
-        self.setting: Setting = getattr(settings, self.kind)(**fields)
+        self.setting: Setting = settings.read_fields(self.kind, fields)
         self.render_mode = render_mode
         self.metadata = {
             "render_modes": [mode for mode in _RENDER_MODES if mode != "human" or _has_screen()],
@@ -309,7 +309,7 @@ class AntVectorEnv(_Offered, VectorEnv[Any, Any, Any]):
         last = self._observation(outcome.obs, self.rows.goal)
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(done).tolist():
-            final[row] = _row_of(last, row)
+            final[row] = row_of(last, row)
         infos: dict[str, Any] = {"final_obs": final, "_final_obs": done.copy()}
         infos |= {"final_info": _batched(outcome.figures, done), "_final_info": done.copy()}
         self._begin_episodes(done)
@@ -346,49 +346,49 @@ class AntVectorEnv(_Offered, VectorEnv[Any, Any, Any]):
 class AntWalker(AntEnv):
     """footwork/AntWalker-v0."""
 
-    kind = "ant_walker"
+    kind = "AntWalker"
 
 
 class AntBandit(AntEnv):
     """footwork/AntBandit-v0."""
 
-    kind = "ant_bandit"
+    kind = "AntBandit"
 
 
 class AntMaze(AntEnv):
     """footwork/AntMaze-v0."""
 
-    kind = "ant_maze"
+    kind = "AntMaze"
 
 
 class AntMazeOptions(AntEnv):
     """footwork/AntMazeOptions-v0."""
 
-    kind = "ant_maze_options"
+    kind = "AntMazeOptions"
 
 
 class AntWalkerVector(AntVectorEnv):
     """footwork/AntWalker-v0, vectorised."""
 
-    kind = "ant_walker"
+    kind = "AntWalker"
 
 
 class AntBanditVector(AntVectorEnv):
     """footwork/AntBandit-v0, vectorised."""
 
-    kind = "ant_bandit"
+    kind = "AntBandit"
 
 
 class AntMazeVector(AntVectorEnv):
     """footwork/AntMaze-v0, vectorised."""
 
-    kind = "ant_maze"
+    kind = "AntMaze"
 
 
 class AntMazeOptionsVector(AntVectorEnv):
     """footwork/AntMazeOptions-v0, vectorised."""
 
-    kind = "ant_maze_options"
+    kind = "AntMazeOptions"
 
 
 def _has_screen() -> bool:
@@ -499,7 +499,8 @@ def _merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     return both
 
 
-def _row_of(obs: Any, row: int) -> Any:
+def row_of(obs: Any, row: int) -> Any:
+    """One row's observation."""
     return {name: part[row] for name, part in obs.items()} if isinstance(obs, dict) else obs[row]
 
 

@@ -24,7 +24,7 @@ from footwork.env import Env
 from footwork.footage import opinion
 from footwork.learn.networks import Policy
 from footwork.options import Options, OptionsState
-from footwork.physics.batch import BatchPhysics
+from footwork.physics import DEFAULT_ENGINE, physics_for
 from footwork.tasks.task import Task
 from footwork.train import (
     Experiment,
@@ -59,7 +59,7 @@ class Master:
     @classmethod
     def of(cls, trained: Trained) -> Master:
         """The first seed's."""
-        return cls(trained.experiment.policy(), jax.tree.map(lambda leaf: leaf[0, 0], trained.params))
+        return cls(trained.experiment.policy(), trained.single())
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +90,12 @@ class Ant:
         task: of the row that leads; its arena is where the ant walks. Nothing ends the episode.
         option_steps: control steps per decision.
         seed: of everything random.
+        engine: the physics under it.
     """
 
-    def __init__(self, sub_policies: Trained, task: Task, option_steps: int, seed: int):
+    def __init__(self, sub_policies: Trained, task: Task, option_steps: int, seed: int, engine: str = DEFAULT_ENGINE):
         task = replace(task, episode_steps=_FOR_EVER, fall_rule="none", goal_radius=None, potential="straight")
-        physics = BatchPhysics(task.robot, task.arena, 1, 1)
+        physics = physics_for(engine, task.robot, task.arena, 1, 1)
         self.row = sub_policies.experiment.name
         self.task = task
         self.env = Options(Env(task, physics), sub_policies.sub_policies(), option_steps)
@@ -192,6 +193,10 @@ class Ant:
         qvel[0, :3] += PUSH * np.array([np.cos(angle), np.sin(angle), 1 / 3])
         physics = inner.physics._replace(qvel=jnp.asarray(qvel, jnp.float32))
         self.state = self.state._replace(inner=inner._replace(physics=physics, stale=jnp.ones(1, bool)))
+
+    def close(self) -> None:
+        """Give back what the engine holds."""
+        self.env.physics.close()
 
     def report(self) -> dict[str, Any]:
         """What the page shows, as JSON would have it."""

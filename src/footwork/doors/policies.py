@@ -117,7 +117,7 @@ def of_trained(trained: Trained, direction: int = 0, seed_index: int = 0, seed: 
     make = partial(LoadedPolicy, experiment, experiment.policy(), direction=direction, seed=seed)
     if experiment.is_walker:
         return make(None, walkers=trained.sub_policies(seed_index))
-    return make(jax.tree.map(lambda leaf: leaf[seed_index, 0], trained.params))
+    return make(trained.single(seed_index))
 
 
 def find_policies(address: str) -> Trained:

@@ -14,7 +14,7 @@ from footwork.record import RunDir, read_metrics
 from footwork.study.experiments import find_row
 from footwork.study.figures import learning_curve, paths_figure
 from footwork.study.runs import find_needed, find_trained, run_path, train_row
-from footwork.train import Trained
+from footwork.train import Trained, choices_of
 
 MASTER_ROW = "maze/hrl/symmetric-interleaved"
 FLAT_ROW = "maze/flat/free"
@@ -65,6 +65,5 @@ def _draw(to: Path, row: str, run: Path, master: Trained, flat: Trained, num_thr
 
 
 def _episodes(trained: Trained, runs: Path, num_threads: int) -> Episodes:
-    needed = find_needed(trained, runs)
-    subs = None if needed is None else needed.sub_policies(deterministic=trained.experiment.deterministic_sub_policies)
+    subs = choices_of(trained.experiment, find_needed(trained, runs))
     return play_episodes(trained, subs, 40, seed=7, num_threads=num_threads)

@@ -21,10 +21,9 @@ from footwork.arena import DIRECTIONS, Arena
 from footwork.checkpoint import write_atomically
 from footwork.footage import Footage, film
 from footwork.physics.skeleton import skeleton
-from footwork.record import RunDir
 from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR
-from footwork.study.runs import find_needed, find_trained, load_run
-from footwork.train import Trained
+from footwork.study.runs import find_needed, find_trained
+from footwork.train import Trained, choices_of
 
 OUTCOMES = {
     "reached": "reached the goal",
@@ -32,6 +31,7 @@ OUTCOMES = {
     "flipped": "turned over",
     "diverged": "simulation failed",
     "truncated": "time is up",
+    "cut": "not over yet",
 }
 
 
@@ -117,22 +117,31 @@ def film_row(
     most_steps: int | None = None,
 ) -> list[Footage]:
     """Film a row by name, or the run in a directory; of a walker row, ``episodes`` in each direction."""
+    trained = find_trained(row, runs)
+    return film_trained(trained, find_needed(trained, runs), episodes, seed, deterministic, num_threads, most_steps)
+
+
+def film_trained(
+    trained: Trained,
+    needed: Trained | None,
+    episodes: int = 1,
+    seed: int = 0,
+    deterministic: bool = False,
+    num_threads: int = 0,
+    most_steps: int | None = None,
+) -> list[Footage]:
+    """Film the first seed's policies; of a walker row, ``episodes`` in each direction.
+
+    Raises:
+        ValueError: not at least one episode, or one step.
+    """
     if episodes < 1:
         raise ValueError(f"episodes must be >= 1, got {episodes}")
     if most_steps is not None and most_steps < 1:
         raise ValueError(f"steps must be >= 1, got {most_steps}")
-    trained = find_policies(row, runs)
-    needed = find_needed(trained, runs)
-    subs = None if needed is None else needed.sub_policies(deterministic=trained.experiment.deterministic_sub_policies)
+    subs = choices_of(trained.experiment, needed)
     count = episodes * (len(DIRECTIONS) if trained.experiment.is_walker else 1)
     return film(trained, subs, count, seed, 0, deterministic, num_threads, most_steps)
-
-
-def find_policies(row: str, runs: Path) -> Trained:
-    """What a row name means, or the finished run in a directory of that name."""
-    if (Path(row) / "config.json").is_file():
-        return load_run(RunDir.open_existing(Path(row)))
-    return find_trained(row, runs)
 
 
 def page(template: str, title: str, styles: Sequence[str], scripts: Sequence[str], data: str) -> str:
@@ -230,4 +239,4 @@ def _base64(array: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-__all__ = ["Replay", "arena_extent", "film_row", "find_policies", "page", "replay"]
+__all__ = ["Replay", "arena_extent", "film_row", "film_trained", "page", "replay"]

@@ -18,8 +18,8 @@ import numpy as np
 
 from footwork.doors.settings import Setting, bounds, term_names
 from footwork.env import Env, Environment, EnvState
-from footwork.options import Options, OptionsState
-from footwork.physics.batch import BatchPhysics
+from footwork.options import Options, OptionsState, task_state
+from footwork.physics import DEFAULT_ENGINE, physics_for
 from footwork.tasks.task import Task
 from footwork.train import COMPILER_OPTIONS
 from footwork.types import NUM_FEET, NUM_JOINTS, QPOS_SIZE, QVEL_SIZE, PhysicsState
@@ -94,7 +94,7 @@ class Rows:
         self._setting, self._num_envs = setting, num_envs
         num_rows = -(-num_envs // BLOCK) * BLOCK
         task = setting.task
-        physics = BatchPhysics(task.robot, task.arena, num_rows, num_threads)
+        physics = physics_for(DEFAULT_ENGINE, task.robot, task.arena, num_rows, num_threads)
         pure = _pure(task, setting.direction, num_rows)
         self._pure: Environment = pure
         self._env: Environment = replace(pure, physics=physics)
@@ -106,7 +106,7 @@ class Rows:
 
     @property
     def _inner(self) -> EnvState:
-        return self._state.inner if isinstance(self._state, OptionsState) else self._state
+        return task_state(self._state)
 
     @property
     def qpos(self) -> np.ndarray:
@@ -221,7 +221,7 @@ def _one_row(env: Any) -> Any:
 def _finish(env: Any, state: Any, packed: Any) -> Any:
     """The step's outcome in two arrays, one of numbers and one of flags: few transfers."""
     state, step = env.finish(state if packed is None else _unpack(state, packed), None)
-    inner = state.inner if isinstance(state, OptionsState) else state
+    inner = task_state(state)
     task = _task(env)
     terms = [step.terms[name] for name in term_names(task)]
     xy = inner.physics.qpos[:, :2]

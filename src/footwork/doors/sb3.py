@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from footwork.doors.gym import AntVectorEnv, make_vector
+from footwork.doors.gym import AntVectorEnv, make_vector, row_of
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -27,16 +27,20 @@ class FootworkVecEnv(VecEnv):
     Args:
         env: made with ``autoreset_mode="SameStep"``.
         every_info: fill the infos of every step.
+        staggered: cut the first episode of each row short, at a random step, so that a rollout holds all
+            phases of an episode and not the same one of every row. For training; a cut episode is
+            truncated, and reported neither as an ``episode`` nor as a success.
     """
 
-    def __init__(self, env: AntVectorEnv, every_info: bool = False):
+    def __init__(self, env: AntVectorEnv, every_info: bool = False, staggered: bool = False):
         if not isinstance(env, AntVectorEnv):
             raise ValueError(f"env must be a vector environment of footwork, got {type(env).__name__}")
         if env.autoreset_mode.value != "SameStep":
             raise ValueError(f"env must be made with autoreset_mode='SameStep', got {env.autoreset_mode.value!r}")
         self.env = env
         self.render_mode = env.render_mode
-        self._every_info = every_info
+        self._every_info, self._staggered = every_info, staggered
+        self._cut_at = np.zeros(env.num_envs, np.int64)  # step that cuts the first episode; 0: none
         self._actions: Any = None
         self._returns, self._lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, np.int64)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -47,6 +51,8 @@ class FootworkVecEnv(VecEnv):
         obs, infos = self.env.reset(seed=seeds)
         self.reset_infos = [_info_of(infos, row) for row in range(self.num_envs)]
         self._returns[:], self._lengths[:] = 0.0, 0
+        if self._staggered:
+            self._cut_at = np.array([rng.integers(0, self.env.setting.most_steps) for rng in self.env.np_random])
         self._reset_seeds()
         self._reset_options()
         return obs
@@ -64,6 +70,13 @@ class FootworkVecEnv(VecEnv):
         rows = [_info_of(infos, row) if self._every_info else {} for row in range(self.num_envs)]
         for row in np.flatnonzero(done):
             rows[row] = self._last_info(infos, int(row), bool(truncated[row] and not terminated[row]))
+        cut = ~done & (self._lengths == self._cut_at)
+        self._cut_at[done | cut] = 0
+        if cut.any():
+            for row in np.flatnonzero(cut):
+                rows[row] |= {"terminal_observation": row_of(obs, int(row)), "TimeLimit.truncated": True}
+            obs, _ = self.env.reset(options={"reset_mask": cut})
+            done = done | cut
         self._returns[done], self._lengths[done] = 0.0, 0
         return obs, rewards.astype(np.float32), done, rows
 
@@ -104,16 +117,19 @@ class FootworkVecEnv(VecEnv):
         return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
 
 
-def make_vec_env(name: str, num_envs: int, every_info: bool = False, **fields: Any) -> FootworkVecEnv:
+def make_vec_env(
+    name: str, num_envs: int, every_info: bool = False, staggered: bool = False, **fields: Any
+) -> FootworkVecEnv:
     """A VecEnv of an id, such as ``footwork/AntMazeOptions-v0``.
 
     Args:
         name: the id.
         num_envs: rows.
         every_info: fill the infos of every step.
+        staggered: cut first episodes short at random, so that rows are not in step.
         **fields: of the environment.
     """
-    return FootworkVecEnv(make_vector(name, num_envs, autoreset_mode="SameStep", **fields), every_info)
+    return FootworkVecEnv(make_vector(name, num_envs, autoreset_mode="SameStep", **fields), every_info, staggered)
 
 
 def _info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -69,6 +70,11 @@ class Setting:
     def has_goal(self) -> bool:
         """Whether there is a place to arrive at."""
         return self.direction is None
+
+    @property
+    def most_steps(self) -> int:
+        """Steps of the environment to the truncation of an episode."""
+        return -(-self.task.episode_steps // self.option_steps)
 
     def at_most(self, steps: int) -> Setting:
         """The setting with episodes of no more than ``steps`` steps of the environment."""
@@ -225,6 +231,37 @@ def ant_maze_options(
     return replace(setting, sub_policies=sub_policies, option_steps=option_steps)
 
 
+MAKERS: dict[str, Callable[..., Setting]] = {
+    "AntWalker": ant_walker,
+    "AntBandit": ant_bandit,
+    "AntMaze": ant_maze,
+    "AntMazeOptions": ant_maze_options,
+}
+
+
+def known_fields(kind: str) -> dict[str, Any]:
+    """The keyword arguments of a kind of environment, one of :data:`MAKERS`, and their defaults."""
+    parameters = dict(inspect.signature(MAKERS[kind]).parameters)
+    if parameters.pop("maze_fields", None) is not None:
+        of_maze = inspect.signature(ant_maze).parameters
+        parameters |= {name: parameter for name, parameter in of_maze.items() if name not in parameters}
+    return {name: parameter.default for name, parameter in parameters.items()}
+
+
+def read_fields(kind: str, fields: Mapping[str, Any]) -> Setting:
+    """The setting that keyword arguments mean.
+
+    Raises:
+        TypeError: some are unknown; lists those that are known.
+        ValueError: a value is.
+    """
+    known = known_fields(kind)
+    unknown = [name for name in fields if name not in known]
+    if unknown:
+        raise TypeError(f"{kind} has no field {', '.join(map(repr, unknown))}; its fields: {', '.join(known)}")
+    return MAKERS[kind](**fields)
+
+
 @lru_cache(maxsize=64)  # the same object for the same policies: what is compiled for them is shared
 def _acting(sub_policies: SubPolicies, deterministic: bool) -> SubPolicies:
     return replace(sub_policies, deterministic=deterministic)
@@ -347,6 +384,7 @@ def bounds(task: Task) -> tuple[np.ndarray, np.ndarray]:
 
 
 __all__ = [
+    "MAKERS",
     "Observed",
     "Setting",
     "ant_bandit",
@@ -354,7 +392,9 @@ __all__ = [
     "ant_maze_options",
     "ant_walker",
     "bounds",
+    "known_fields",
     "observed",
     "reach",
+    "read_fields",
     "term_names",
 ]

@@ -16,7 +16,7 @@ from footwork.study.results import Results
 from footwork.study.sweep import run_study
 
 if TYPE_CHECKING:
-    from footwork.doors.cli import Reproduce
+    from footwork.doors.commands.studying import Reproduce
 
 
 def reproduce(command: Reproduce) -> int:

@@ -22,7 +22,7 @@ from footwork.record import RunDir, RunError, versions
 from footwork.study.plan import Size
 from footwork.study.runs import NEEDED, load_policies, load_run
 from footwork.tasks.task import SUCCESS_RADII
-from footwork.train import Experiment, Trained
+from footwork.train import Experiment, Trained, choices_of
 
 EVALUATION, TRANSITIONS = "evaluation.json", "transitions.json"
 FORMAT = 1
@@ -100,10 +100,7 @@ def _one_by_one(trained: Trained) -> list[Trained]:
 
 def _evaluation(run: RunDir, trained: Trained, size: Size, num_threads: int) -> dict[str, Any]:
     experiment = trained.experiment
-    subs = None
-    if experiment.is_master:
-        needed = load_policies(run.path / NEEDED)
-        subs = needed.sub_policies(deterministic=experiment.deterministic_sub_policies)
+    subs = choices_of(experiment, load_policies(run.path / NEEDED) if experiment.is_master else None)
     count = size.walker_episodes if experiment.is_walker else size.episodes
     seed = trained.seeds[0]
     episodes = play_episodes(trained, subs, count, EVALUATION_SEED + seed, num_threads=num_threads)

@@ -26,7 +26,7 @@ from footwork import checkpoint
 from footwork.checkpoint import CheckpointError
 from footwork.physics import require_engine
 from footwork.record import RunDir, RunError, config_from_json, config_to_json, versions
-from footwork.study.experiments import find_row, with_robot
+from footwork.study.experiments import find_row, is_row, with_robot
 from footwork.train import Experiment, Trained, planned_steps, policy_meta, train
 
 NEEDED = "needed.safetensors"
@@ -230,6 +230,7 @@ def find_trained(address: str, runs: Path) -> Trained:
     """
     run = _run_at(address)
     if run is None:
+        _refuse_other_places(address)
         return _find(find_row(address), runs)
     if not run.finished:
         raise RunError(f"{address} holds an unfinished run")
@@ -243,6 +244,17 @@ def _run_at(address: str) -> RunDir | None:
     except ValueError:
         return RunDir(Path(address)) if (Path(address) / "config.json").is_file() else None
     return None
+
+
+def _refuse_other_places(address: str) -> None:
+    """Say of a path that exists, and is no row's address, why it is no run: the table of rows would not help."""
+    path = Path(address)
+    if is_row(address) or not path.exists():
+        return
+    if path.is_dir():
+        raise ValueError(f"{address} is a folder, but not of a run or an export: it has no config.json")
+    hint = f": name its folder, {path.parent}" if (path.parent / "config.json").is_file() else ""
+    raise ValueError(f"{address} is a file, and a row's name or the folder of a run is wanted{hint}")
 
 
 def _find(experiment: Experiment, runs: Path) -> Trained:

@@ -2,7 +2,7 @@
 
 const TRACE = 1800; // points of the way behind an ant
 const PACES = [0.25, 0.5, 1, 2, 4];
-const KEYS = { ArrowRight: 0, ArrowUp: 1, ArrowLeft: 2, ArrowDown: 3 };
+const KEYS = { arrowright: 0, arrowup: 1, arrowleft: 2, arrowdown: 3, e: 0, n: 1, w: 2, s: 3 };
 const byId = (id) => document.getElementById(id);
 
 class Live extends Stage {
@@ -70,7 +70,7 @@ class Live extends Stage {
       l: () => this.toggleTheme(),
       "?": () => byId("keys").showModal(),
     };
-    const direction = KEYS[event.key], act = actions[event.key.toLowerCase()];
+    const key = event.key.toLowerCase(), direction = KEYS[key], act = actions[key];
     if (direction === undefined && !act) return;
     event.preventDefault();
     if (direction === undefined) act();
@@ -205,6 +205,9 @@ class Live extends Stage {
     const style = getComputedStyle(document.body), x = (u) => u * (canvas.width - 4) + 2, y = (v) => (1 - v) * (canvas.height - 4) + 2;
     pen.strokeStyle = style.getPropertyValue("--line");
     for (const v of [0, 0.5, 1]) pen.strokeRect(0, Math.round(y(v)) + 0.5, canvas.width, 0);
+    pen.fillStyle = style.getPropertyValue("--faint");
+    pen.font = `${10 * scale}px sans-serif`;
+    pen.fillText("100 %", 2, 11 * scale);
     pen.strokeStyle = this.hex[0];
     pen.lineWidth = 2 * scale;
     pen.beginPath();

@@ -427,6 +427,7 @@ const THEMES = {
   dark: { back: "#17191d", line: "#7d828c", wall: "#4b505a", shin: "#a9aeb8", dark: 1 },
 };
 const FOV = 0.72; // rad, vertical
+const CARD = 250; // px that the card takes of a panel
 const GOAL = "#D55E00";
 const ARROWS = ["→", "↑", "←", "↓"];
 const IDENTITY = [1, 0, 0, 0, 1, 0, 0, 0, 1];
@@ -704,16 +705,21 @@ class Stage {
 
   cameraOf(panel, pose) {
     const { box } = panel, aspect = box.w / box.h;
+    const { azimuth, elevation } = this.view, flat = Math.cos(elevation);
     let { distance } = this.view;
     let target = [pose[0], pose[1], 0.4];
     if (this.view.fit) {
       const [x, y, halfX, halfY] = panel.extent;
       target = [x, y, 0];
       const tall = this.camera === "above" ? halfY : halfY * 0.86 + 1;
-      distance *= (1.04 * Math.max(tall, halfX / aspect)) / Math.tan(FOV / 2) / 10.5 + (this.camera === "above" ? 0.2 : 0);
+      // The card would hide the upper left corner: the arena stands right of it, a little smaller where there is no room.
+      const wide = halfX / aspect, fill = Math.max(tall, wide), beside = box.w > 2 * CARD ? wide / (1 - CARD / box.w) : 0;
+      const size = Math.max(fill, Math.min(beside, 1.2 * fill));
+      distance *= (1.04 * size) / Math.tan(FOV / 2) / 10.5 + (this.camera === "above" ? 0.2 : 0);
+      const aside = Math.min(CARD / box.w, 0.8 * (1 - wide / size)) * distance * Math.tan(FOV / 2) * aspect;
+      target = minus(target, [-Math.sin(azimuth) * aside, Math.cos(azimuth) * aside, 0]);
     }
     target = plus(target, this.view.shift);
-    const { azimuth, elevation } = this.view, flat = Math.cos(elevation);
     const eye = plus(target, times([Math.cos(azimuth) * flat, Math.sin(azimuth) * flat, Math.sin(elevation)], distance));
     const top = [-Math.cos(azimuth) * Math.sin(elevation), -Math.sin(azimuth) * Math.sin(elevation), flat];
     const back = unit(minus(eye, target)), axes = { right: cross(top, back), top, back };

@@ -74,7 +74,7 @@ def test_the_report_names_what_is_skipped_and_is_whole(tmp_path, monkeypatch):
     """On the engine that is always there; the others are as if they were not installed."""
     monkeypatch.setattr(engines, "find_spec", lambda name: None)
     monkeypatch.setattr(parity, "ANTS", (parity.REFERENCE, SHIPPED, parity.DEVICE))
-    monkeypatch.setattr(parity, "race", lambda *arguments: {})
+    monkeypatch.setattr(parity, "race", lambda *arguments: ({}, {}))
     monkeypatch.setattr(parity, "handover", lambda *arguments: {"straight_mps": 1.0, "success": 0.5})
     said = []
     work = Parity(replace(QUICK, episode=3), None, said.append)

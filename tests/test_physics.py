@@ -261,7 +261,7 @@ def test_a_diverged_row_is_reported_until_it_is_reset(logless, how):
 
 def test_engines_are_known_by_name_and_a_missing_one_names_its_extra(tmp_path, monkeypatch):
     assert isinstance(physics_for("mujoco", HEAVY, open_field(), 1), BatchPhysics)
-    with pytest.raises(ValueError, match="unknown engine 'ode'; known engines: mujoco, bullet, bullet-original"):
+    with pytest.raises(ValueError, match="unknown engine 'ode'; known engines: mujoco, mjx, bullet, bullet-original"):
         physics_for("ode", HEAVY, open_field(), 1)
     monkeypatch.setattr("footwork.physics.find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"^engine bullet needs an extra: pip install 'footwork\[bullet\]'$"):

@@ -245,7 +245,7 @@ def test_an_engine_makes_a_row_of_its_own(tmp_path):
     assert find_row(master.needs).needs == "bullet/walker/plain"
     assert with_engine(master, "mujoco") == find_row("mujoco/maze/hrl/appropriate-bias") == EXPERIMENTS[master.name[7:]]
     assert path_of_new_run(tmp_path, master, (0,)) == tmp_path / "bullet/maze/hrl/appropriate-bias/seed-0"
-    with pytest.raises(ValueError, match="unknown engine 'ode'; known engines: mujoco, bullet"):
+    with pytest.raises(ValueError, match="unknown engine 'ode'; known engines: mujoco, mjx, bullet"):
         replace(master, engine="ode")
     with pytest.raises(RunError, match="no finished run of bullet/walker/plain in"):
         find_trained("bullet/walker/plain", tmp_path)

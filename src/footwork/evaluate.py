@@ -30,9 +30,9 @@ SWITCHING_PERIODS = (25, 50, 100, 200)  # control steps per option
 HANDOVER_AFTER = (100, 200)  # control steps of the first policy, uniform in this range in multiples of the segment
 HANDOVER_STEPS = 300  # control steps of the second
 HANDOVER_SPEED = 0.5  # m/s along the second, over all its steps, from which a hand-over counts as a success
+_STRETCH = 100  # decisions at most between two looks whether all rows have ended, on a device
 _PATH_STEPS = 10  # control steps between two looks at a path that no master leads
 _SEGMENT = 25  # control steps between two looks
-_STRETCH = 100  # decisions at most between two looks whether all rows have ended, on a device
 _NUM_DIRECTIONS = len(DIRECTIONS)
 _UNIT = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)  # of the directions, world frame
 
@@ -102,30 +102,30 @@ class _Course(NamedTuple):
 def _play_out(experiment: Experiment, env: Environment, act: Any, key: Key) -> _Course:
     """Play until every row's episode has ended."""
     num_decisions = math.ceil(experiment.task.episode_steps / experiment.steps_per_decision)
+    play = loop_over(env.physics, partial(_decide, env, act, key))
     stretch = math.gcd(num_decisions, _STRETCH) if env.physics.traceable else 1  # of one length: it is compiled once
-    state, obs = env.initial(jax.random.fold_in(key, 0))
-    start = _positions(state)
-    play = loop_over(env.physics, partial(_decision, env, act, key))
-    seen = []
-    for first in range(0, num_decisions, stretch):
-        if np.asarray(task_state(state).held).all():
+    playing, kept = env.initial(jax.random.fold_in(key, 0)), []
+    start = _positions(playing[0])
+    for first in range(1, 1 + num_decisions, stretch):
+        if np.asarray(task_state(playing[0]).held).all():
             break
-        (state, obs), kept = play((state, obs), np.arange(first + 1, first + 1 + stretch, dtype=np.int32))
-        seen.append(jax.tree.map(np.asarray, kept))
-    ended, positions, events, progress, choices = jax.tree.map(lambda *leaves: np.concatenate(leaves), *seen)
-    paths = np.concatenate([start[None], positions[:: 1 if experiment.is_master else _PATH_STEPS]])
+        playing, stretch_kept = play(playing, np.arange(first, first + stretch, dtype=np.int32))
+        kept.append(jax.tree.map(np.asarray, stretch_kept))
+    ended, positions, events, progress, choices = jax.tree.map(lambda *leaves: np.concatenate(leaves), *kept)
     choices = choices if experiment.is_master else np.zeros((0, env.num_envs), np.int32)
-    return _Course(events, progress, choices, ended, paths)
+    steps_per_look = 1 if experiment.is_master else _PATH_STEPS
+    return _Course(events, progress, choices, ended, np.concatenate([start[None], positions[::steps_per_look]]))
 
 
-def _decision(env: Environment, act: Any, key: Key, playing: tuple[Any, Array], number: Array) -> tuple[Any, Any]:
+def _decide(env: Environment, act: Any, key: Key, playing: tuple[Any, Array], number: Array) -> tuple[Any, Any]:
     """One decision of the policy under test, as the body of a loop, and what is kept of it."""
     state, obs = playing
-    over = task_state(state).held
+    ended = task_state(state).held
     state, action, simulate_key, finish_key = act(state, obs, key, number)
     state, step = finish_step(env, env.simulate(state, simulate_key), finish_key)
     choice = action if isinstance(env, Options) else ()
-    return (state, step.obs), (over, task_state(state).physics.qpos[:, :2], step.events, step.terms["progress"], choice)
+    kept = (ended, task_state(state).physics.qpos[:, :2], step.events, step.terms["progress"], choice)
+    return (state, step.obs), kept
 
 
 def _summary(experiment: Experiment, course: _Course) -> Episodes:

@@ -15,9 +15,10 @@ from typing import Any
 
 import tyro
 
+from footwork.doors.commands.comparing import Parity
 from footwork.doors.commands.running import Evaluate, Export, List, Quickstart, Train, Transitions
 from footwork.doors.commands.seeing import Play, Replay, Video
-from footwork.doors.commands.studying import Bench, Figures, Parity, Report, Reproduce
+from footwork.doors.commands.studying import Bench, Figures, Report, Reproduce
 
 # In the order of ``footwork --help``.
 Command = (

@@ -158,7 +158,8 @@ class Parity:
                 yield from ((f"{engine}/{WALKERS[0]}", load_run(run)) for run in runs[:1])
 
     def _speed(self) -> None:
-        self.found["speed"] = race(self.ants, self.size, self.say)
+        self.found["speed"], failed = race(self.ants, self.size, self.say)
+        self.found["skipped"] |= {f"{name}, speed": why for name, why in failed.items()}
 
     def _curves(self) -> None:
         self.found["curves"] = {} if self.runs is None else read_curves(self.runs, self.say)
@@ -336,8 +337,12 @@ def handover(trained: Trained, ant: Ant, ants: int) -> dict[str, float]:
 # Speed ----------------------------------------------------------------------------------------------------------------
 
 
-def race(ants: tuple[Ant, ...], size: Size, say: Say) -> dict[str, Any]:
-    """Control steps per second through the protocol, each engine in a process of its own, asked in turn."""
+def race(ants: tuple[Ant, ...], size: Size, say: Say) -> tuple[dict[str, Any], dict[str, str]]:
+    """Control steps per second through the protocol, each engine in a process of its own, asked in turn.
+
+    Returns:
+        The rates of those that were measured, and why others were not.
+    """
     records: dict[str, Record] = {}
     teams: dict[str, Team] = {}
     try:
@@ -354,11 +359,12 @@ def race(ants: tuple[Ant, ...], size: Size, say: Say) -> dict[str, Any]:
         for team in teams.values():
             team.close()
     shipped = records[SHIPPED.name].series()
-    return {
+    rates = {
         name: {"steps_per_second": spread(list(series.values())), "over_shipped": ratio(series, shipped)}
         for name, record in records.items()
         if (series := record.series())
     }
+    return rates, {name: record.skipped for name, record in records.items() if record.skipped}
 
 
 def _start(contestant: Contestant, teams: dict[str, Team], record: Record, say: Say) -> None:
@@ -373,6 +379,7 @@ def _ask(teams: dict[str, Team], name: str, record: Record, number: int, seconds
     try:
         record.samples[number] = teams[name].sample(seconds)
     except ContestantFailed as failure:
+        record.skipped = str(failure)
         say(f"going on without {name}: {failure}")
         teams.pop(name).close()
 

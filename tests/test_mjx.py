@@ -68,7 +68,7 @@ class Hovercraft:
         pass
 
 
-@pytest.fixture(params=["walker/plain", "walker/interleaved", "maze/hrl/plain"])
+@pytest.fixture(params=["walker/interleaved", "maze/hrl/plain"])
 def on_both(request, monkeypatch):
     """Calls a function of the row with the engine on the host, and with it on a device."""
 

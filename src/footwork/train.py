@@ -21,7 +21,7 @@ from footwork import checkpoint
 from footwork.arena import DIRECTIONS
 from footwork.autoreset import AutoReset
 from footwork.collect import Carry, collect, start
-from footwork.env import Env, Environment
+from footwork.env import Env, Environment, host_jit
 from footwork.learn import ppo
 from footwork.learn.config import PPOConfig
 from footwork.learn.networks import Policy, categorical_policy, gaussian_policy
@@ -200,12 +200,9 @@ def begin_learning(experiment: Experiment, env: Environment, seeds: tuple[int, .
     return Learning(0, learners, start(env, jax.random.fold_in(jax.random.key(seeds[0]), 1)))
 
 
+@partial(host_jit, num_static=2)
 def fresh_learners(policy: Policy, config: PPOConfig, keys: Key) -> ppo.TrainState:
-    """One learner per key.
-
-    Not in one jit: two QR factorisations of one program may each hold a thread of XLA's pool
-    and wait for ever for another (seen with jaxlib 0.10.2 on two cores).
-    """
+    """One learner per key."""
     return jax.vmap(partial(ppo.init, policy, config))(keys)
 
 

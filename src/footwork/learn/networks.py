@@ -147,10 +147,9 @@ class Policy:
         nearly the same in every state.
         """
         actor_key, critic_key = jax.random.split(key)
-        return {
-            "actor": _init_net(actor_key, (self.obs_size, *self.hidden_sizes, self.head.num_outputs), 0.01),
-            "critic": _init_net(critic_key, (self.obs_size, *self.hidden_sizes, 1), 1.0),
-        }
+        actor = _init_net(actor_key, (self.obs_size, *self.hidden_sizes, self.head.num_outputs), 0.01)
+        critic_key = _once_there(actor["output"]["weight"], critic_key)
+        return {"actor": actor, "critic": _init_net(critic_key, (self.obs_size, *self.hidden_sizes, 1), 1.0)}
 
     def outputs(self, params: Params, obs: Float[Array, "*B D"]) -> Float[Array, "*B O"]:
         """What the actor tells its head."""
@@ -186,11 +185,24 @@ def _init_net(key: Key, sizes: tuple[int, ...], output_gain: float) -> Params:
     num_layers = len(sizes) - 1
     names = [f"hidden_{i + 1}" for i in range(num_layers - 1)] + ["output"]
     gains = [math.sqrt(2.0)] * (num_layers - 1) + [output_gain]
-    net = {}
+    net: dict[str, Params] = {}
     for i, layer_key in enumerate(jax.random.split(key, num_layers)):
+        if i > 0:
+            layer_key = _once_there(net[names[i - 1]]["weight"], layer_key)
         weight = jax.nn.initializers.orthogonal(gains[i])(layer_key, (sizes[i], sizes[i + 1]), jnp.float32)
         net[names[i]] = {"weight": weight, "bias": jnp.zeros(sizes[i + 1], jnp.float32)}
     return net
+
+
+def _once_there(weight: Array, key: Key) -> Key:
+    """The key, but not before the weight is computed.
+
+    Two QR factorisations of one program may each hold a thread of XLA's pool and wait for ever for
+    another (seen with jaxlib 0.10.2 on two cores), so they take turns. XLA drops an
+    ``optimization_barrier`` before it schedules, but it cannot know that no weight is NaN.
+    """
+    data = jax.random.key_data(key)
+    return jax.random.wrap_key_data(jnp.where(jnp.isnan(weight[0, 0]), ~data, data), impl=jax.random.key_impl(key))
 
 
 def _apply_net(net: Params, x: Float[Array, "*B d_in"]) -> Float[Array, "*B d_out"]:

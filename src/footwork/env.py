@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -91,6 +91,11 @@ class _Changes:
         return self.tree.unflatten([next(changed) if place is None else given[place] for place in self.source])
 
 
+@cache
+def _is_traced(kind: type) -> bool:
+    return issubclass(kind, jax.core.Tracer)
+
+
 def host_jit(function: Callable[..., Any], num_static: int = 1) -> Callable[..., Any]:
     """``jax.jit`` for the calls of a host loop; the first ``num_static`` arguments are static.
 
@@ -110,7 +115,7 @@ def host_jit(function: Callable[..., Any], num_static: int = 1) -> Callable[...,
     @wraps(function)
     def call(*args: Any) -> Any:
         given = jax.tree.leaves(args[num_static:])
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in given):
+        if any(map(_is_traced, map(type, given))):
             return function(*args)
         return changes(*args).applied_to(given)
 

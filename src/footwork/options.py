@@ -122,9 +122,9 @@ class Options:
 
     def control_step(self, key: Key, state: OptionsState, i: Int[Array, ""]) -> tuple[OptionsState, None]:
         """Control step ``i`` of the option: what :meth:`simulate` runs k of, for those who want to see each."""
-        state = _option_begin(self, state, key, i)
-        state = state._replace(inner=self.inner.simulate(state.inner, key))
-        return _option_finish(self, state, key, i), None
+        action = _act(self.sub_policies, state.obs, state.choice, key, i)
+        inner = self.inner.simulate(self.inner.begin(state.inner, action, key), key)
+        return _option_finish(self, state._replace(inner=inner), key, i), None
 
     def finish(self, state: OptionsState, key: Key) -> tuple[OptionsState, TimeStep]:
         """What the whole option brought."""
@@ -138,11 +138,11 @@ class Options:
 
 
 @host_jit
-def _option_begin(env: Options, state: OptionsState, key: Key, i: Int[Array, ""]) -> OptionsState:
+def _act(sub_policies: SubPolicies, obs: Array, choice: Array, key: Key, i: Int[Array, ""]) -> Array:
+    """The chosen sub-policies' actions, from these alone and not the whole state: a call pays for each leaf."""
     split = jax.vmap(jax.random.split, out_axes=1) if key.ndim else jax.random.split
-    act_key, begin_key = split(_fold(key, 2 * i))
-    action = env.sub_policies.act(state.obs, state.choice, act_key)
-    return state._replace(inner=env.inner.begin(state.inner, action, begin_key))
+    act_key, _ = split(_fold(key, 2 * i))
+    return sub_policies.act(obs, choice, act_key)
 
 
 @host_jit

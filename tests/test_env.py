@@ -545,7 +545,8 @@ def test_episode_sums_run_on_over_rollouts():
 
 def test_a_master_is_traced_once_too(lively, monkeypatch):
     task = replace(ANT_MAZE, episode_steps=7)
-    env = AutoReset(Options(Env(task, BatchPhysics(task.robot, task.arena, N, 1), staggered=True), lively, 2))
+    sub_policies = replace(lively)  # not those that another test has had traced
+    env = AutoReset(Options(Env(task, BatchPhysics(task.robot, task.arena, N, 1), staggered=True), sub_policies, 2))
     master = categorical_policy(CONFIG, 34, 4)
     carry = start(env, jax.random.key(1))
     methods = ((AutoReset, "begin"), (AutoReset, "finish"), (SubPolicies, "act"), (Env, "finish"))

@@ -129,7 +129,7 @@ def test_an_export_shows_an_episode(exported):
 
 
 def test_an_export_does_not_write_over_anything(exported):
-    with pytest.raises(RunError, match="finished run"):
+    with pytest.raises(RunError, match="holds something already: choose another folder with --to"):
         export("maze/hrl/plain", exported, NOWHERE, 1)
 
 
@@ -144,8 +144,26 @@ def test_exported_sub_policies_carry_a_master(exported, tmp_path, monkeypatch):
     for env in (folder, packaged):
         env.reset(seed=0)
     assert np.array_equal(folder.step(1)[0], packaged.step(1)[0])
-    with pytest.raises(ValueError, match="must walk in four directions"):
-        gymnasium.make("footwork/AntMazeOptions-v0", sub_policies=str(exported))
+    master = gymnasium.make("footwork/AntMazeOptions-v0", sub_policies=str(exported), option_steps=2).unwrapped
+    assert master.setting.sub_policies.policy == packaged.setting.sub_policies.policy
+
+
+@pytest.mark.parametrize(
+    ("row", "call"),
+    [
+        ("walker/interleaved", 'gymnasium.make("footwork/AntWalker-v0", direction="up", fall_rule="either")'),
+        ("maze/hrl/plain", 'gymnasium.make("footwork/AntMazeOptions-v0", sub_policies="DIR")'),
+        ("bandit/hrl/plain", None),  # there is no such id
+        (
+            "maze/flat/guided-free",
+            'gymnasium.make("footwork/AntMaze-v0", potential="geodesic", goal_reward=200.0, xy_scale=0.125)',
+        ),
+    ],
+)
+def test_a_card_tells_how_to_make_the_rows_environment(row, call):
+    from footwork.doors.export import _environment
+
+    assert _environment(find_row(row), "DIR") == call
 
 
 def test_a_missing_extra_is_named_in_one_line(monkeypatch, capsys, tmp_path):

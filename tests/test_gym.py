@@ -7,6 +7,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -253,19 +254,34 @@ def test_weights_directions_and_lengths_are_fields():
     assert make_vec("AntMazeOptions-v0", 1, max_episode_steps=3).setting.task.episode_steps == 6
 
 
+def test_numbers_of_numpy_are_numbers():
+    setting = settings.read_fields(
+        "AntMazeOptions", {"option_steps": np.int64(7), "cell": np.float32(3), "penalties": np.True_}
+    )
+    assert (setting.option_steps, setting.task.arena.cell) == (7, 3.0)
+    assert setting.task.weights.electricity < 0
+    assert make_vec("AntMaze-v0", np.int64(2)).num_envs == 2
+
+
+def test_a_master_brings_the_sub_policies_that_it_stands_on():
+    given = settings.read_fields("AntMazeOptions", {"sub_policies": "maze/hrl/plain"}).sub_policies
+    own = settings.read_fields("AntMazeOptions", {"sub_policies": "walker/plain"}).sub_policies
+    assert jax.tree.all(jax.tree.map(np.array_equal, given.params, own.params))
+
+
 # ---------------------------------------------------------------- pictures
 
 
 def test_frames_where_there_is_no_opengl(monkeypatch):
-    from footwork.doors import frames
+    from footwork.doors import frames, render
 
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    frames._platform.cache_clear()
+    render.choose_platform.cache_clear()
     env = make("AntMaze-v0", render_mode="rgb_array")
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="no OpenGL here"):
         image = env.render()
-    frames._platform.cache_clear()
+    render.choose_platform.cache_clear()
     assert image.shape == (frames.HEIGHT, frames.WIDTH, 3)
     assert image.dtype == np.uint8
     assert len(np.unique(image.reshape(-1, 3), axis=0)) >= 5  # floor, wall, legs, shins, torso
@@ -287,7 +303,18 @@ def test_vectors_render_every_row():
         ("AntWalker-v0", {"direction": "north"}, "unknown direction 'north'; known: right, up, left, down"),
         ("AntWalker-v0", {"robot": "cat"}, "unknown robot 'cat'"),
         ("AntWalker-v0", {"reward_weights": {"alve": 1.0}}, "unknown reward_weights 'alve'; known: progress"),
-        ("AntWalker-v0", {"reward_weights": {"alive": np.nan}}, "must be finite"),
+        ("AntWalker-v0", {"reward_weights": {"alive": np.nan}}, "'alive'\\] must be a finite number, got nan"),
+        ("AntWalker-v0", {"reward_weights": {"alive": None}}, "must be a finite number, got None"),
+        ("AntWalker-v0", {"reward_weights": 3}, "must be weights by name"),
+        ("AntWalker-v0", {"robot": ["heavy"]}, "robot must be a word"),
+        ("AntWalker-v0", {"episode_steps": 1.5}, "episode_steps must be a whole number >= 1, got 1.5"),
+        ("AntWalker-v0", {"episode_steps": True}, "episode_steps must be a whole number"),
+        ("AntMaze-v0", {"goal_reward": np.nan}, "goal_reward must be a finite number, got nan"),
+        ("AntMaze-v0", {"goal_radius": np.inf}, "goal_radius must be a finite number > 0, or None, got inf"),
+        ("AntMaze-v0", {"xy_scale": 0}, "xy_scale must be a finite number > 0"),
+        ("AntMaze-v0", {"cell": "wide"}, "cell must be a finite number > 0, or None, got 'wide'"),
+        ("AntMaze-v0", {"start_noise": -1.0}, "start_noise must be a finite number >= 0"),
+        ("AntMaze-v0", {"penalties": "no"}, "penalties must be True or False, got 'no'"),
         ("AntMaze-v0", {"maze_map": "nowhere"}, "no maze 'nowhere': neither a file nor one of u, spiral"),
         ("AntMaze-v0", {"maze_map": [[1, 1, 1], [1, 1], [1, 1, 1]]}, r"equally long, got lengths \[3, 2, 3\]"),
         ("AntMaze-v0", {"maze_map": [[1, 1, 1], [1, 7, 1], [1, 1, 1]]}, "unknown maze cell 7"),
@@ -297,11 +324,13 @@ def test_vectors_render_every_row():
         ("AntMaze-v0", {"goal": "here"}, "goal must be"),
         ("AntMaze-v0", {"goal_conditioned": True}, "needs reward='sparse' or 'dense'"),
         ("AntMaze-v0", {"reward": "rich"}, "reward must be task, sparse or dense"),
-        ("AntMazeOptions-v0", {"option_steps": 0}, "option_steps must be >= 1"),
+        ("AntMazeOptions-v0", {"option_steps": 0}, "option_steps must be a whole number >= 1"),
+        ("AntMazeOptions-v0", {"option_steps": "5"}, "option_steps must be a whole number >= 1, got '5'"),
+        ("AntMazeOptions-v0", {"sub_policies": None}, "sub_policies must be a row"),
         ("AntMazeOptions-v0", {"sub_policies": "walker/none"}, "walker/none"),
         ("AntMazeOptions-v0", {"sub_policies": "maze/flat/free"}, "must walk in four directions"),
         ("AntMazeOptions-v0", {"robot": "light"}, "the environment has ant 'light'"),
-        ("AntBandit-v0", {"half_size": 0.0}, "half_size must be > 0"),
+        ("AntBandit-v0", {"half_size": 0.0}, "half_size must be a finite number > 0"),
         ("AntBandit-v0", {"render_mode": "ascii"}, "render_mode must be"),
     ],
 )
@@ -320,6 +349,10 @@ def test_unknown_ids_and_fields_are_named():
         make_vec("AntMaze-v0", 2, autoreset_mode="Never")
     with pytest.raises(ValueError, match="num_envs"):
         make_vec("AntMaze-v0", 0)
+    with pytest.raises(ValueError, match="num_envs must be a whole number"):
+        make_vec("AntMaze-v0", True)
+    with pytest.raises(ValueError, match="max_episode_steps must be a whole number"):
+        make_vec("AntMaze-v0", 1, max_episode_steps=2.5)
 
 
 def test_bad_actions_are_refused_naming_the_row_and_nothing_is_lost():

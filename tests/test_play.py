@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,9 +23,10 @@ if find_spec("websockets") is None:
     pytest.skip("needs the extra [play]", allow_module_level=True)
 
 from PIL import Image
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from footwork.checkpoint import CheckpointError
 from footwork.doors import live, play
 from footwork.doors import visit as visit_module
 from footwork.doors.cli import run
@@ -63,7 +63,7 @@ def shared_visit(heard):
 def visit(shared_visit, heard):
     heard.clear()
     shared_visit.do_restart()
-    shared_visit.do_goal_quietly(shared_visit.arena.goals[0])
+    shared_visit._put_goal(shared_visit.arena.goals[0])
     shared_visit.who = "trained"
     return shared_visit
 
@@ -182,6 +182,9 @@ def test_falls_flips_and_arrivals_are_counted_once(visit):
         ('{"what": 1}', "do"),
         ("[]", ""),
         ("nonsense", "Expecting value"),
+        ('{"do": "steer", "direction": 1e999}', "direction must be 0..3"),
+        ('{"do": "push", "angle": 1' + 400 * "0" + "}", "too large"),
+        ("[" * 60_000, "recursion"),
     ],
 )
 def test_what_cannot_be_done_is_said_and_changes_nothing(visit, heard, wish, answer):
@@ -191,6 +194,46 @@ def test_what_cannot_be_done_is_said_and_changes_nothing(visit, heard, wish, ans
     assert heard[-1]["bad"]
     assert (visit.ants, visit.arena) == (ants, arena)
     visit.ants[0].step(visit.current_leaders()[0])
+
+
+@pytest.mark.parametrize(
+    "wish", ['{"do": "sub_policies", "rows": ["walker/plain"]}', '{"do": "arena", "name": "spiral"}']
+)
+def test_what_cannot_be_loaded_leaves_everything_as_it_is(visit, heard, wish, monkeypatch):
+    def damaged(row, runs):
+        raise CheckpointError("policy.safetensors: damaged")
+
+    ants, rows, arena = visit.ants, visit.rows, visit.arena
+    with monkeypatch.context() as patch:
+        patch.setattr(visit_module, "find_trained", damaged)
+        patch.setattr(visit, "find_sub_policies", lambda row: damaged(row, None))
+        visit.hear(wish)
+    assert words(heard)[-1] == "policy.safetensors: damaged"
+    assert (visit.ants, visit.rows, visit.arena) == (ants, rows, arena)
+    assert [message["name"] for message in heard if message["is"] == "scene"] == [arena.name]
+    visit.ants[0].step(visit.current_leaders()[0])
+
+
+def test_a_page_that_comes_back_is_told_everything(visit, heard, monkeypatch):
+    class Learning:
+        params = None
+
+        def curve(self):
+            return [(0.5, 0.25)]
+
+        def report(self):
+            return {"step": 1, "running": False, "ways": [[1, 2, 3, 4, 0]]}
+
+    monkeypatch.setattr(visit, "lesson", Learning())
+    monkeypatch.setattr(visit, "lesson_arena", visit.arena)
+    told = []
+    monkeypatch.setattr(visit, "tell", visit.tell)
+    visit.welcome_back(told.append)
+    assert [message["is"] for message in told] == ["scene", "lesson"]
+    assert (told[1]["fresh"], told[1]["curve"], len(told[1]["ways"])) == (True, [(0.5, 0.25)], 1)
+    monkeypatch.setattr(visit, "lesson_arena", None)
+    visit.report_lesson()
+    assert told[-1]["ways"] == []  # they were walked in another place
 
 
 def test_time_goes_by_at_the_pace_asked_for(visit):
@@ -293,6 +336,13 @@ class Company:
             raise RuntimeError("broken")
         self.tell({"is": "word", "text": text})
 
+    def say(self, text, stays=False):
+        self.tell({"is": "word", "text": text})
+
+    def welcome_back(self, tell):
+        self.tell = tell
+        tell({"is": "scene", "again": True})
+
     def leave(self):
         Company.left.append("left")
 
@@ -310,6 +360,7 @@ def served(monkeypatch):
     server.shutdown()
     thread.join(30)
     assert not thread.is_alive()
+    house.empty()
 
 
 def hear(connection, kind):
@@ -331,30 +382,52 @@ def test_the_page_is_served_to_this_machine_only(served):
     assert status == 200
     assert "<title>Footwork</title>" in text
     assert "{{" not in text
+    assert get(port, "/?from=a-bookmark")[0] == 200
     assert get(port, "/other")[0] == 404
     assert get(port, Host="evil.example")[0] == 403
+    assert get(port, Host="[")[0] == 403
     with pytest.raises(InvalidStatus):
         connect(f"ws://127.0.0.1:{port}/ants", origin="http://evil.example")
     with connect(f"ws://127.0.0.1:{port}/ants", origin=f"http://127.0.0.1:{port}") as visitor:
         assert hear(visitor, "frame")["count"] >= 1
 
 
-def test_a_second_visitor_waits_for_a_seat(served):
+def test_a_second_visitor_waits_for_a_seat(served, monkeypatch):
     house, port = served
+    monkeypatch.setattr(visit_module, "KEPT_SECONDS", 0.5)
     address = f"ws://127.0.0.1:{port}/ants"
     with connect(address) as first:
         hear(first, "frame")
         with connect(address) as second:
             assert hear(second, "word")["text"] == "1 visitor is here already; you are next"
+            with connect(address) as third:
+                assert hear(third, "word")["text"] == "1 visitor is here already; 1 more before you"
             first.socket.close()  # gone without a word
             hear(second, "frame")
             second.send("still there?")
             assert hear(second, "word")["text"] == "still there?"
-    until = time.monotonic() + 60
-    while house.taken and time.monotonic() < until:
-        time.sleep(0.05)
+    assert Company.left == ["left"]
+    house.empty()
     assert house.taken == []
     assert Company.left == ["left", "left"]
+
+
+def test_a_page_that_comes_back_finds_its_visit(served):
+    house, port = served
+    address = f"ws://127.0.0.1:{port}/ants?visit=mine"
+    with connect(address) as page:
+        assert hear(page, "frame")["count"] == 1
+    with connect(address) as page:
+        assert hear(page, "scene").get("again")
+        assert hear(page, "frame")["count"] > 1
+        with connect(address) as another:  # as when the window is duplicated
+            assert hear(page, "word")["text"] == "this visit goes on in another window"
+            with pytest.raises(ConnectionClosed) as closed:
+                hear(page, "nothing more")
+            assert closed.value.rcvd.code == play.ELSEWHERE
+            assert hear(another, "scene").get("again")
+    assert [seat.token for seat in house.taken] == ["mine"]
+    assert Company.left == []
 
 
 def test_a_visit_that_breaks_is_one_visits_end(served, caplog):
@@ -380,6 +453,7 @@ def test_a_taken_port_is_said(served, capsys):
         (["nothing"], "unknown row 'nothing'"),
         ([ROW, "--seats", "0"], "seats must be >= 1, got 0"),
         ([ROW, "--port", "70000"], "port must be in 0..65535, got 70000"),
+        ([ROW, "--lesson-steps", "0"], "lesson_steps must be >= 1, got 0"),
         ([ROW, "--host", "256.1.1.1"], "256.1.1.1"),
     ],
 )
@@ -390,12 +464,23 @@ def test_what_play_refuses(arguments, message, capsys):
     assert error.count("\n") == 1
 
 
-def test_ctrl_c_closes_cleanly():
+@pytest.mark.parametrize("learns", [None, False, True], ids=["nobody there", "a visitor", "a lesson"])
+def test_ctrl_c_closes_cleanly(learns):
     command = [sys.executable, "-m", "footwork", "play", "--port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     line = process.stdout.readline()
     assert line.startswith("http://127.0.0.1:")
-    process.send_signal(signal.SIGINT)
+    if learns is None:
+        process.send_signal(signal.SIGINT)
+    else:
+        with connect(line.split()[0].replace("http", "ws", 1) + "ants") as visitor:
+            hear(visitor, "frame")
+            if learns:
+                visitor.send('{"do": "train"}')
+                hear(visitor, "lesson")
+            process.send_signal(signal.SIGINT)
+            with pytest.raises(ConnectionClosed):
+                hear(visitor, "nothing more")
     out, err = process.communicate(timeout=120)
     assert (process.returncode, out, err) == (0, "closing\n", "")
 
@@ -431,13 +516,15 @@ def page(tmp_path, request):
     server = open_server(house, port=0)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
-    browser = Browser(str(tmp_path / "profile"), 900, 700)
+    flags = ("--disable-3d-apis",) if "without_webgl" in request.keywords else ()
+    browser = Browser(str(tmp_path / "profile"), 900, 700, flags)
     browser.open(f"http://127.0.0.1:{server.socket.getsockname()[1]}/")
     yield browser
     browser.close()
     house.closing.set()
     server.shutdown()
     thread.join(60)
+    house.empty()
 
 
 def draw_a_corridor(browser):
@@ -479,8 +566,27 @@ def test_a_visit_in_a_browser(page):
     page.run("document.getElementById('train').click(); return 1")
     page.wait("return document.getElementById('learned').textContent === '26 k of 26 k'", 300)
     page.wait("return footwork.state.who === 'lesson'")
+    page.run("location.reload(); return 1")  # loses nothing: the maze, its master, and what was learned
+    page.wait("return window.footwork?.state.who === 'lesson' && footwork.panels[0].name === 'drawn'")
+    assert page.run("return footwork.curve.length") > 0
     assert page.complaints() == []
-    assert {url.split("/", 3)[3] for url in page.requested()} <= {"", "ants"}
+    assert {url.split("/", 3)[3].partition("?")[0] for url in page.requested()} <= {"", "ants"}
+
+
+@pytest.mark.skipif(not AVAILABLE, reason=MISSING)
+@pytest.mark.without_webgl
+def test_clicks_go_where_they_are_drawn_without_webgl_too(page):
+    page.wait("return footwork.panels[0]?.ant?.steps > 3 && footwork.renderer === null", 240)
+    box = page.run("const r = document.getElementById('view').getBoundingClientRect(); return [r.x, r.y]")
+    for camera, goal in (("whole", (4.0, -4.0)), ("above", (-4.0, 4.0))):
+        page.run("footwork.setCamera(arguments[0]); return 1", camera)
+        place = page.run("return footwork.project(footwork.panels[0], arguments[0])", goal)
+        page.click(box[0] + place[0], box[1] + place[1])
+        page.wait(f"const g = footwork.state.ants[0].goal; return Math.hypot(g[0] - {goal[0]}, g[1] - {goal[1]}) < 0.2")
+    x, y = (round(float(number)) for number in page.run("return footwork.project(footwork.panels[0], [-4, 4])"))
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+    seen = picture[round(box[1]) + y - 3 : round(box[1]) + y + 3, round(box[0]) + x - 3 : round(box[0]) + x + 3]
+    assert np.abs(seen - 255 * np.array(rgb(GOAL_COLOUR))).max(axis=-1).min() < 40  # it is drawn where it was clicked
 
 
 @slow

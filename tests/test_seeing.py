@@ -184,8 +184,12 @@ def test_what_a_replay_refuses():
         (["replay", "maze/flat/free", "--steps", "0"], "steps must be >= 1, got 0"),
         (["replay"], "replay needs at least one row or run directory"),
         (["video", "maze/flat/free", "-o", "ant.avi"], "must end in one of .mp4, .webp, .gif, got '.avi'"),
-        (["video", "maze/flat/free", "--width", "33"], "width must be even and >= 32, got 33"),
-        (["video", "maze/flat/free", "--speed", "0"], "speed must be > 0, got 0"),
+        (["video", "maze/flat/free", "--width", "33"], "width must be even and in 32..4096, got 33"),
+        (["video", "maze/flat/free", "--width", "20000"], "width must be even and in 32..4096, got 20000"),
+        (["video", "maze/flat/free", "--speed", "0"], "speed must be > 0 and <= 1000, got 0"),
+        (["video", "maze/flat/free", "--speed", "inf"], "speed must be > 0 and <= 1000, got inf"),
+        (["video", "maze/flat/free", "-o", "/dev/null/a.webp"], "cannot write /dev/null/a.webp: "),
+        (["replay", "maze/flat/free", "-o", "/"], "cannot write /: it is a directory"),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, capsys, tmp_path, monkeypatch):
@@ -223,7 +227,7 @@ def test_a_damaged_or_foreign_run_is_refused(tmp_path, capsys):
 
 @pytest.mark.parametrize("camera", ["follow", "arena", "above"])
 def test_the_sketch_shows_ant_goal_path_and_walls(camera):
-    painter = render.painter(shot(), 160, 120, camera, None)
+    painter = render.FilmPainter(shot(), 160, 120, camera, None)
     picture = painter.paint(60).astype(int)
     assert picture.shape == (120, 160, 3)
     seen = {tuple(colour) for colour in picture.reshape(-1, 3)}
@@ -283,7 +287,7 @@ def test_mujocos_renderer_where_there_is_one():
     platform, reason = render.choose_platform()
     if platform is None:
         pytest.skip(f"no OpenGL here: {reason}")
-    painter = render.painter(shot(), 128, 96, "arena", platform)
+    painter = render.FilmPainter(shot(), 128, 96, "arena", platform)
     picture = painter.paint(60)
     assert picture.shape == (96, 128, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50

@@ -33,7 +33,7 @@ FLAGS = (
 class Browser:
     """One window. Slow machines are waited for."""
 
-    def __init__(self, profile: str, width: int = 900, height: int = 640):
+    def __init__(self, profile: str, width: int = 900, height: int = 640, flags: tuple[str, ...] = ()):
         self._driver = subprocess.Popen(
             [str(CHROMEDRIVER), "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
@@ -45,7 +45,7 @@ class Browser:
         self._url = f"http://127.0.0.1:{found.group(1)}"
         options = {
             "binary": CHROMIUM,
-            "args": [*FLAGS, f"--window-size={width},{height}", f"--user-data-dir={profile}"],
+            "args": [*FLAGS, *flags, f"--window-size={width},{height}", f"--user-data-dir={profile}"],
         }
         wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"}}
         timeouts = {"pageLoad": 180_000, "script": 180_000}

@@ -18,6 +18,7 @@ import hashlib
 import json
 import os
 import re
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -139,6 +140,22 @@ def write_atomically(path: Path, data: bytes | Iterable[bytes], what: str = "fil
         )
         raise CheckpointError(f"{failed}; the previous {what} is intact") from error
     _sync_directory(path.parent)
+
+
+def check_writable(path: Path) -> None:
+    """Refuse, before the work is done, a place where no file could be put; makes its directory.
+
+    Raises:
+        CheckpointError: it is a directory, or nothing can be written beside it.
+    """
+    if path.is_dir():
+        raise CheckpointError(f"cannot write {path}: it is a directory, and the name of a file is wanted")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise CheckpointError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def is_full(error: OSError) -> bool:

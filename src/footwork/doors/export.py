@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from footwork import checkpoint
 from footwork.arena import DIRECTIONS
 from footwork.checkpoint import write_atomically
 from footwork.doors.replay import Replay, film_trained
+from footwork.doors.settings import known_fields, read_fields
 from footwork.evaluate import evaluate
-from footwork.record import RunDir, config_to_json
+from footwork.record import RunDir, RunError, config_to_json
 from footwork.study.experiments import find_row, is_row
 from footwork.study.runs import NEEDED, PACKAGED, find_needed, find_trained, packaged
 from footwork.tasks.task import SUCCESS_RADII
+from footwork.tasks.terms import PENALISED_WEIGHTS
 from footwork.train import Experiment, Trained
 
 REPLAY = "replay.html"
@@ -51,7 +54,7 @@ def export(
         episodes: per seed, for the card's figures.
         seed: of the episodes.
         num_threads: of the physics; changes no number.
-        onnx: also write ONNX files, those of the first seed.
+        onnx: also write ONNX files, those of the first seed; of a master, those of its sub-policies too.
 
     Raises:
         ValueError: the address is unknown.
@@ -61,6 +64,8 @@ def export(
     """
     if onnx:
         from footwork.doors.onnx import write_onnx  # what is missing is said before anything is written
+    if to.exists() and not (to.is_dir() and not any(to.iterdir())):
+        raise RunError(f"{to} holds something already: choose another folder with --to")
     trained = find_trained(address, runs)
     needed = find_needed(trained, runs)
     meta = _meta(trained)
@@ -69,7 +74,11 @@ def export(
         run.save_policy(trained.params, meta)
         if needed is not None:
             checkpoint.save(to / NEEDED, needed.params, _meta(needed))
-        files: list[Path] = list(write_onnx(trained, to)) if onnx else []
+        files: list[Path] = []
+        if onnx:
+            files = [
+                path for policies in (trained, needed) if policies is not None for path in write_onnx(policies, to)
+            ]
         shown = film_trained(trained, needed, 1, seed, num_threads=num_threads)
         Replay(tuple(shown), f"Footwork: {trained.experiment.name}").save(to / REPLAY)
         report = evaluate(trained, needed, episodes, seed, num_threads=num_threads)
@@ -197,7 +206,8 @@ def _figures(report: dict[str, Any], seed: int) -> list[str]:
         rows.append(("time to the goal", f"{report['time_to_goal_s']:.1f} s"))
     seeds = ", ".join(map(str, report["seeds"]))
     over = "episodes" if len(report["seeds"]) == 1 else "seeds and episodes"
-    said = f"{report['episodes']} episodes (policy of seed {seeds}; episodes from seed {seed}), sampled actions, 95 %"
+    count = f"{report['episodes']:,} episode{'' if report['episodes'] == 1 else 's'}"
+    said = f"{count} (policy of seed {seeds}; episodes from seed {seed}), sampled actions, 95 %"
     said += f" intervals over {over}:"
     return [said, "", "| | |", "|---|---|", *(f"| {what} | {figure} |" for what, figure in rows)]
 
@@ -215,7 +225,46 @@ def _usage(trained: Trained, folder: str) -> list[str]:
     else:
         lines += [f'policy = load_policy("{folder}")']
     lines += ["action, _ = policy.predict(obs, deterministic=True)", "```"]
+    made = _environment(experiment, folder)
+    if made:
+        lines += ["", "where it was trained, as a Gymnasium environment (extra `footwork[gym]`):", "", "```python"]
+        lines += ["import gymnasium", "import footwork.doors.gym", "", f"env = {made}", "```"]
     return lines
+
+
+def _environment(experiment: Experiment, folder: str) -> str | None:
+    """The call that makes the Gymnasium environment of the row's task; None where no id has just these fields."""
+    task = experiment.task
+    kind = {"AntBandit": None if experiment.is_master else "AntBandit"}.get(task.name, task.name)
+    if kind is None:
+        return None
+    fields: dict[str, Any] = {
+        "direction": "up",
+        "half_size": max(abs(x) for x, _ in task.arena.goals),
+        "maze_map": task.arena.name,
+        "potential": task.potential,
+        "penalties": replace(task.weights, goal=0.0) == PENALISED_WEIGHTS,
+        "goal_radius": task.goal_radius,
+        "goal_reward": task.weights.goal,
+        "xy_scale": task.xy_scale,
+        "robot": task.robot.name,
+        "episode_steps": task.episode_steps,
+        "fall_rule": task.fall_rule,
+    }
+    fields = {name: value for name, value in fields.items() if name in known_fields(kind)}
+    try:
+        fits = read_fields(kind, fields).task == task
+    except ValueError:  # a maze or an ant that has no name
+        return None
+    if not fits:
+        return None
+    if experiment.is_master:
+        kind = f"{kind}Options"
+        fields |= {"sub_policies": folder, "option_steps": experiment.option_steps}
+    defaults = known_fields(kind)
+    told = {name: value for name, value in fields.items() if name == "direction" or value != defaults[name]}
+    words = (f"{name}={json.dumps(value) if isinstance(value, str) else repr(value)}" for name, value in told.items())
+    return f"gymnasium.make({', '.join([json.dumps(f'footwork/{kind}-v0'), *words])})"
 
 
 def _rate(rate: float, interval: list[float]) -> str:

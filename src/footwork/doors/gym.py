@@ -21,6 +21,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -35,7 +36,7 @@ except ImportError as error:
     raise ImportError(f"footwork.doors.gym needs Gymnasium: pip install 'footwork[gym]' ({error})") from None
 
 if TYPE_CHECKING:
-    from footwork.doors.frames import Painter
+    from footwork.doors.frames import Shower
     from footwork.doors.rows import Outcome, Rows
     from footwork.doors.settings import Setting
 
@@ -74,7 +75,7 @@ class _Offered:
         }
         self._num_rows, self._num_threads = num_envs, num_threads
         self._made: Rows | None = None
-        self._painter: Painter | None = None
+        self._shower: Shower | None = None
 
     @property
     def rows(self) -> Rows:
@@ -107,17 +108,17 @@ class _Offered:
             raise gymnasium.error.Error(
                 "render() needs a render_mode: make the environment with 'rgb_array' or 'human'"
             )
-        if self._painter is None:
-            from footwork.doors.frames import painter
+        if self._shower is None:
+            from footwork.doors.frames import shower
 
-            self._painter = painter(self.setting.task, self.render_mode)
+            self._shower = shower(self.setting.task, self.render_mode)
         goal = self.rows.goal[row] if self.setting.has_goal else None
-        return self._painter.draw(self.rows.qpos[row], goal)
+        return self._shower.draw(self.rows.qpos[row], goal, int(self.rows.choice[row]))
 
     def _close(self) -> None:
-        if self._painter is not None:
-            self._painter.close()
-        self._painter = self._made = None
+        if self._shower is not None:
+            self._shower.close()
+        self._shower = self._made = None
 
     # Goals, for learners that relabel them
 
@@ -234,11 +235,10 @@ class AntVectorEnv(_Offered, VectorEnv[Any, Any, Any]):
         **fields: Any,
     ):
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        if not isinstance(num_envs, int) or num_envs < 1:
-            raise ValueError(f"num_envs must be a whole number >= 1, got {num_envs!r}")
+        num_envs = _count("num_envs", num_envs)
         self._offer(num_envs, num_threads, render_mode, fields)
         if max_episode_steps is not None:
-            self.setting = self.setting.at_most(max_episode_steps)
+            self.setting = self.setting.at_most(_count("max_episode_steps", max_episode_steps))
         self.metadata["autoreset_mode"] = self.autoreset_mode
         self.num_envs = num_envs
         self.single_observation_space = self._observation_space()
@@ -408,6 +408,17 @@ def make_vector(name: str, num_envs: int, **fields: Any) -> AntVectorEnv:
 
 
 # Numbers in and out -------------------------------------------------------------------------------------------------
+
+
+def _count(name: str, value: Any) -> int:
+    """A whole number >= 1, numpy's too.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+        raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")
+    return int(value)
 
 
 def _checked(actions: Any, setting: Setting, num_envs: int, single: bool = False) -> np.ndarray:

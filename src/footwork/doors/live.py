@@ -245,6 +245,7 @@ class Lesson:
         self._needed, self._seed = needed, seed
         self._stop = threading.Event()
         self._ways: deque[list[int]] = deque(maxlen=4000)
+        self._curve: list[tuple[float, float]] = []
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="lesson", daemon=True)
         self._thread.start()
@@ -265,6 +266,11 @@ class Lesson:
     def master(self) -> Master | None:
         """The newest master, once there is one."""
         return None if self.params is None else Master(self.experiment.policy(), self.params)
+
+    def curve(self) -> list[tuple[float, float]]:
+        """Success so far: (share of the lesson, share of episodes), one point per update that has one."""
+        with self._lock:
+            return list(self._curve)
 
     def report(self) -> dict[str, Any]:
         """What the page shows; ``ways`` are pieces [x, y, x, y, choice] in cm walked since the last report."""
@@ -311,6 +317,8 @@ class Lesson:
                 self.success = round(reached / episodes, 3) if episodes else None
                 self.progress = round(way / episodes, 2) if episodes else None
                 self._ways.extend(ways)
+                if self.success is not None:
+                    self._curve.append((round(self.step / self.total, 4), self.success))
             self.params = jax.tree.map(lambda leaf: leaf[0], learning.learners.params)
 
 

@@ -2,25 +2,29 @@
 
 One thread per visitor: it hears what the visitor wants, steps the visitor's own ants in real
 time and tells the page of them. Visitors share nothing but the processor, so there are seats
-for few; who comes later waits for one.
+for few; who comes later waits for one. A page that is loaded again, or was cut off, finds its
+visit as it was, its lesson too, unless somebody who waited has taken the seat.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
+import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 from footwork.arena import DIRECTIONS, MAZES
 from footwork.doors.replay import page
-from footwork.doors.visit import FRAMES_PER_SECOND, LESSON_STEPS, SQUARE, House, Visit, known_walkers
+from footwork.doors.visit import FRAMES_PER_SECOND, LESSON_STEPS, SQUARE, House, Seat, Visit, known_walkers
 from footwork.physics.skeleton import skeleton
 from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.study.runs import find_trained
@@ -34,48 +38,80 @@ except ImportError as error:
     raise ImportError("the page needs websockets: pip install 'footwork[play]'") from error
 
 _WAIT = 1.0  # s between looks for a free seat
+_TELL_AGAIN = 5.0  # s between two words to somebody who waits
+_TOKEN_LENGTH = 64
+ELSEWHERE = 4001  # the code with which a page is closed whose visit another page goes on with; live.js knows it
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
 def attend(house: House, connection: ServerConnection) -> None:
     """A visitor's thread, from coming to going."""
-    name = f"{connection.remote_address}"
     tell: Callable[[dict[str, Any]], None] = lambda message: connection.send(json.dumps(message))  # noqa: E731
-    visit: Visit | None = None
+    seat: Seat | None = None
     try:
-        _take_seat(house, name, tell)
-        visit = Visit(house, tell)
-        _keep_company(house, visit, connection)
+        seat = _take_seat(house, _token_of(connection), connection, tell)
+        if seat is None:
+            return
+        with seat.here:
+            _receive(house, seat, tell)
+            _keep_company(house, seat, connection)
     except ConnectionClosed:
         pass  # they went away; the server stays
     except Exception as error:
-        tell({"is": "word", "text": f"the visit ended: {error}", "bad": True, "stays": True})
+        if seat is not None:
+            house.dismiss(seat)
+        with contextlib.suppress(ConnectionClosed):
+            tell({"is": "word", "text": f"the visit ended: {error}", "bad": True, "stays": True})
         raise
     finally:
-        if visit is not None:
-            visit.leave()
-        with house.lock:
-            if name in house.taken:
-                house.taken.remove(name)
+        if seat is not None and seat.connection is connection:
+            seat.connection, seat.left_at = None, time.monotonic()
 
 
-def _take_seat(house: House, name: str, tell: Callable[[dict[str, Any]], None]) -> None:
-    told = -1
-    while not house.closing.is_set():
-        with house.lock:
-            if len(house.taken) < house.seats:
-                house.taken.append(name)
-                return
-        told = (told + 1) % 5
-        if told == 0:  # again now and then, which also notices who has left
-            text = f"{house.seats} {'visitor is' if house.seats == 1 else 'visitors are'} here already; you are next"
-            tell({"is": "word", "text": text, "bad": False, "stays": True})
-        time.sleep(_WAIT)
+def _token_of(connection: ServerConnection) -> str:
+    """What the page calls its visit, so that it finds it again; a page that says nothing has a visit of its own."""
+    query = parse_qs(urlsplit(connection.request.path).query) if connection.request else {}
+    return query.get("visit", [""])[0][:_TOKEN_LENGTH] or str(connection.id)
 
 
-def _keep_company(house: House, visit: Visit, connection: ServerConnection) -> None:
+def _take_seat(
+    house: House, token: str, connection: ServerConnection, tell: Callable[[dict[str, Any]], None]
+) -> Seat | None:
+    """The seat of this token, or a free one, when it is this visitor's turn; None when the house closes."""
+    told_at, told = -_TELL_AGAIN, ""
+    try:
+        while not house.closing.is_set():
+            seat, before = house.sit(token, connection)
+            if seat is not None:
+                return seat
+            text = _please_wait(house.seats, before)
+            if text != told or time.monotonic() - told_at >= _TELL_AGAIN:  # which also notices who has left
+                tell({"is": "word", "text": text, "bad": False, "stays": True})
+                told_at, told = time.monotonic(), text
+            time.sleep(_WAIT)
+    finally:
+        house.stand_up(connection)
+    return None
+
+
+def _please_wait(seats: int, before: int) -> str:
+    here = f"{seats} {'visitor is' if seats == 1 else 'visitors are'} here already"
+    return f"{here}; {f'{before} more before you' if before else 'you are next'}"
+
+
+def _receive(house: House, seat: Seat, tell: Callable[[dict[str, Any]], None]) -> None:
+    """Begin a visit, or go on with the one that this page had before it was loaded again or cut off."""
+    if seat.visit is None:
+        seat.visit = Visit(house, tell)
+    else:
+        seat.visit.welcome_back(tell)
+
+
+def _keep_company(house: House, seat: Seat, connection: ServerConnection) -> None:
+    visit = seat.visit
+    assert visit is not None
     last = due = time.monotonic()
-    while not house.closing.is_set():
+    while not house.closing.is_set() and seat.connection is connection:
         _hear_all(visit, connection)
         now = time.monotonic()
         visit.step(now - last)
@@ -84,6 +120,9 @@ def _keep_company(house: House, visit: Visit, connection: ServerConnection) -> N
         visit.report_lesson()
         due = max(due, now - 1 / FRAMES_PER_SECOND) + 1 / FRAMES_PER_SECOND  # a late picture is made up for by the next
         time.sleep(max(0.0, due - time.monotonic()))
+    if not house.closing.is_set():
+        visit.say("this visit goes on in another window", stays=True)
+        connection.close(ELSEWHERE)
 
 
 def _hear_all(visit: Visit, connection: ServerConnection) -> None:
@@ -98,16 +137,25 @@ def _hear_all(visit: Visit, connection: ServerConnection) -> None:
 def _answer(text: bytes, hosts: tuple[str, ...], request: Request) -> Response | None:
     """The page, or None for the page's own socket. Other sites' pages may not talk to it."""
     host = request.headers.get("Host", "")
-    if hosts and urlsplit(f"//{host}").hostname not in hosts:
+    if hosts and _name_of(host) not in hosts:
         return _response(HTTPStatus.FORBIDDEN, b"this page is for this machine\n", "text/plain")
-    if request.path == "/ants":
+    path = request.path.partition("?")[0]
+    if path == "/ants":
         origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and origin.partition("://")[2] != host:
             return _response(HTTPStatus.FORBIDDEN, b"from this page only\n", "text/plain")
         return None
-    if request.path == "/":
+    if path == "/":
         return _response(HTTPStatus.OK, text, "text/html; charset=utf-8")
     return _response(HTTPStatus.NOT_FOUND, b"there is one page: /\n", "text/plain")
+
+
+def _name_of(host: str) -> str | None:
+    """A machine's name without its port; None where it is none."""
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:
+        return None
 
 
 def _response(status: HTTPStatus, body: bytes, kind: str) -> Response:
@@ -149,6 +197,7 @@ def open_server(house: House, host: str = "127.0.0.1", port: int = 8765) -> Serv
             process_request=lambda connection, request: _answer(text, hosts, request),
             max_size=64 * 1024,
             compression=None,
+            family=socket.AF_INET6 if ":" in host else socket.AF_INET,
         )
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
@@ -158,34 +207,45 @@ def open_server(house: House, host: str = "127.0.0.1", port: int = 8765) -> Serv
         raise ValueError(f"port must be in 0..65535, got {port}") from None
 
 
+def address_of(server: Server) -> str:
+    """Where a browser finds the page."""
+    host, port = server.socket.getsockname()[:2]
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+
+
 def play(row: str, runs: Path, host: str, port: int, seats: int, lesson_steps: int = LESSON_STEPS) -> None:
     """Serve the page until interrupted.
 
     Raises:
-        ValueError: the row is no master, there is no seat, or the port is taken.
+        ValueError: the row is no master, there is no seat, lessons have no steps, or the port is taken.
     """
-    if seats < 1:
-        raise ValueError(f"seats must be >= 1, got {seats}")
+    for name, number in (("seats", seats), ("lesson_steps", lesson_steps)):
+        if number < 1:
+            raise ValueError(f"{name} must be >= 1, got {number}")
     trained = find_trained(row, runs)
     if not trained.experiment.is_master:
         raise ValueError(f"play shows masters (maze/hrl/..., bandit/hrl/...), not {trained.experiment.name}")
     house = House(runs, row, seats, lesson_steps)
     server = open_server(house, host, port)
+    closing = threading.Thread(target=server.shutdown, name="closing")  # waits for what this thread does
 
     def close(number: int, frame: Any) -> None:
-        house.closing.set()  # visitors' threads end at their next picture
-        threading.Thread(target=server.shutdown, name="closing").start()  # it waits for what this thread does
+        if house.closing.is_set():
+            os._exit(128 + number)  # asked a second time: visitors are not waited for
+        house.closing.set()  # their threads end at their next picture
+        closing.start()
 
     # A handler that asks and does not raise: before it serves, a server that is interrupted would never be closed.
     old = [(number, signal.signal(number, close)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
-        address = server.socket.getsockname()
-        print(f"http://{address[0]}:{address[1]}/   (Ctrl-C ends it)", flush=True)
+        print(f"{address_of(server)}   (Ctrl-C ends it)", flush=True)
         server.serve_forever()
-        print("closing")
+        print("closing", flush=True)
+        closing.join()  # visitors' threads need the interpreter whole
+        house.empty()
     finally:
         for number, handler in old:
-            signal.signal(number, handler)  # a second Ctrl-C does not wait for visitors
+            signal.signal(number, handler)
 
 
 __all__ = ["attend", "open_server", "play", "world"]

@@ -19,7 +19,7 @@ from footwork.study.runs import find_trained, packaged
 from footwork.train import Experiment, Trained
 from footwork.types import Params
 
-_NOWHERE = Path(os.devnull)  # runs are looked for there: none is found
+NOWHERE = Path(os.devnull)  # runs are looked for there: none is found
 
 
 @dataclass(eq=False)
@@ -127,7 +127,7 @@ def find_policies(address: str) -> Trained:
         ValueError: the address is unknown.
         RunError: nothing has been trained there.
     """
-    return find_trained(address, _NOWHERE if packaged(address).is_file() else Path("runs"))
+    return find_trained(address, NOWHERE if packaged(address).is_file() else Path("runs"))
 
 
 def _first_bad(rows: np.ndarray) -> str:
@@ -136,4 +136,4 @@ def _first_bad(rows: np.ndarray) -> str:
     return f"of row {int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])} "
 
 
-__all__ = ["LoadedPolicy", "find_policies", "load_policy", "of_trained"]
+__all__ = ["NOWHERE", "LoadedPolicy", "find_policies", "load_policy", "of_trained"]

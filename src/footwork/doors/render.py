@@ -1,7 +1,7 @@
-"""Pictures of filmed episodes: by MuJoCo's renderer where OpenGL works without a screen, else drawn from above.
+"""Pictures of an ant: by MuJoCo's renderer where OpenGL works without a screen, else drawn from above with a pen.
 
-A painter is made for one episode and paints the moment after any control step:
-``paint(step) -> [height, width, 3] uint8``.
+A painter is made for one task and paints shots of it: ``paint(Shot) -> [height, width, 3] uint8``.
+:class:`FilmPainter` paints the moment after any control step of a filmed episode.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ import importlib
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from typing import Any, Literal, Protocol
 
 import mujoco
@@ -22,6 +23,7 @@ from footwork.doors.replay import extent
 from footwork.footage import Footage
 from footwork.physics.mjcf import build_spec
 from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR, GOAL_COLOUR, rgb
+from footwork.tasks.task import Task
 
 CameraName = Literal["follow", "arena", "above"]
 PLATFORMS = ("egl", "osmesa")  # OpenGL without a screen: on a driver, and in software
@@ -31,26 +33,67 @@ _BACKGROUND = (0.955, 0.95, 0.935)
 _WALL = (0.68, 0.69, 0.72)
 _WALL_HEIGHT = 0.5  # m, as drawn: walls of 2 m would hide the ant
 _MARGIN = 0.6  # m
+_GOAL_RADIUS = 0.5  # m, as drawn where nothing ends an episode
 _FOLLOW_DISTANCE = 8.0  # m
 _PATH_HALF_WIDTH = 0.06  # m
-_CURVE_STEPS = 4  # control steps per piece of a drawn path
+_PIECE_STEPS = 4  # control steps per piece of a drawn path
+
+
+Colour = tuple[float, float, float]  # each in [0, 1]
+Piece = tuple[np.ndarray, np.ndarray, Colour]  # of a path: from [2], to [2] in m
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What one picture shows.
+
+    Args:
+        qpos: the ant, [15].
+        tint: its colour.
+        goal: [2] in m; None where there is none to arrive at.
+        path: the way so far.
+        look_at: the point [2] of the floor that a following camera looks at.
+    """
+
+    qpos: np.ndarray
+    tint: Colour
+    goal: np.ndarray | None
+    path: Sequence[Piece]
+    look_at: np.ndarray
 
 
 class Painter(Protocol):
-    """Paints one episode."""
+    """Paints shots of one task."""
 
-    def paint(self, step: int) -> np.ndarray:
-        """The moment after ``step`` control steps, [height, width, 3] uint8."""
+    def paint(self, shot: Shot) -> np.ndarray:
+        """A picture, [height, width, 3] uint8."""
 
     def close(self) -> None:
         """Give back what the renderer holds."""
 
 
-def painter(footage: Footage, width: int, height: int, camera: CameraName, platform: str | None) -> Painter:
-    """The painter of an episode on an OpenGL platform, or the one that needs none."""
-    if platform is None:
-        return SketchPainter(footage, width, height, camera)
-    return GLPainter(footage, width, height, camera, platform)
+@dataclass(frozen=True)
+class View:
+    """How a painter looks at a task.
+
+    Args:
+        width: px.
+        height: px.
+        camera: follows the ant, or shows ``extent`` at an angle (arena) or from above.
+        extent: centre x, y and half sizes (m) of what there is to see.
+        most_pieces: of a path.
+    """
+
+    width: int
+    height: int
+    camera: CameraName
+    extent: tuple[float, float, float, float]
+    most_pieces: int = 0
+
+
+def painter(task: Task, view: View, platform: str | None) -> Painter:
+    """The painter of a task on an OpenGL platform, or the one that needs none."""
+    return SketchPainter(task, view) if platform is None else GLPainter(task, view, platform)
 
 
 @cache
@@ -90,64 +133,62 @@ def _try_platform(name: str) -> str | None:
     return lines[-1] if lines else f"exit status {done.returncode}"
 
 
-def colour_of(choice: int) -> tuple[float, float, float]:
+def colour_of(choice: int) -> Colour:
     """Of a sub-policy's direction, or of a flat policy."""
     return rgb(FLAT_COLOUR if choice < 0 else DIRECTION_COLOURS[choice])
 
 
 class _Pose:
-    """The ant of a film: a model that is posed, never stepped."""
+    """The ant of a picture: a model that is posed, never stepped."""
 
-    def __init__(self, footage: Footage, spec: mujoco.MjSpec):
-        self.footage = footage
+    def __init__(self, spec: mujoco.MjSpec):
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.parts = [self.model.geom(number).name.split("_")[0] for number in range(self.model.ngeom)]
 
-    def at(self, step: int) -> tuple[float, float, float]:
-        """Pose the ant after ``step`` control steps and paint its parts; returns the colour of who moved it there."""
-        self.data.qpos[:] = self.footage.qpos[step]
+    def take(self, qpos: np.ndarray, tint: Colour) -> None:
+        """Pose the ant and paint its parts."""
+        self.data.qpos[:] = qpos
         mujoco.mj_forward(self.model, self.data)
-        tint = colour_of(int(self.footage.choice[max(step - 1, 0)]))
         for number, part in enumerate(self.parts):
             if part in ("torso", "stub", "thigh", "shin"):
                 self.model.geom_rgba[number, :3] = self.shade(part, tint)
-        return tint
 
     @staticmethod
-    def shade(part: str, tint: tuple[float, float, float]) -> tuple[float, ...]:
+    def shade(part: str, tint: Colour) -> Colour:
         mixed = {"shin": 1.0, "thigh": 0.25}.get(part, 0.0)
-        return tuple(a + (b - a) * mixed for a, b in zip(tint, _SHIN, strict=True))
+        red, green, blue = (a + (b - a) * mixed for a, b in zip(tint, _SHIN, strict=True))
+        return red, green, blue
 
 
 class GLPainter:
     """MuJoCo's own renderer."""
 
-    def __init__(self, footage: Footage, width: int, height: int, camera: CameraName, platform: str):
-        self._context = importlib.import_module(f"mujoco.{platform}").GLContext(width, height)
+    def __init__(self, task: Task, view: View, platform: str):
+        self._context = importlib.import_module(f"mujoco.{platform}").GLContext(view.width, view.height)
         self._context.make_current()
-        self._pose = _Pose(footage, _furnished(footage, width, height))
-        self._scene = mujoco.MjvScene(self._pose.model, maxgeom=2000 + footage.num_steps // _CURVE_STEPS)
+        self._task, self._view = task, view
+        self._pose = _Pose(_furnished(task, view))
+        self._scene = mujoco.MjvScene(self._pose.model, maxgeom=2000 + view.most_pieces)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = True
         self._renderer = mujoco.MjrContext(self._pose.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._renderer)
-        self._rectangle = mujoco.MjrRect(0, 0, width, height)
-        self._pixels = np.empty((height, width, 3), np.uint8)
-        self._camera_name, self._footage = camera, footage
-        self._way = smooth_way(footage)
+        self._rectangle = mujoco.MjrRect(0, 0, view.width, view.height)
+        self._pixels = np.empty((view.height, view.width, 3), np.uint8)
 
-    def paint(self, step: int) -> np.ndarray:
+    def paint(self, shot: Shot) -> np.ndarray:
         self._context.make_current()
-        self._pose.at(step)
+        self._pose.take(shot.qpos, shot.tint)
         options, perturbation = mujoco.MjvOption(), mujoco.MjvPerturb()
-        camera = _gl_camera(self._camera_name, self._footage, self._way[step], self._rectangle)
+        camera = _gl_camera(self._view, shot.look_at)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(
             self._pose.model, self._pose.data, options, perturbation, camera, everything, self._scene
         )
-        _add_path(self._scene, self._footage, step)
-        _add_goal(self._scene, self._footage)
+        _add_path(self._scene, shot.path)
+        if shot.goal is not None:
+            _add_goal(self._scene, shot.goal.astype(np.float64), self._task.goal_radius or _GOAL_RADIUS)
         mujoco.mjr_render(self._rectangle, self._scene, self._renderer)
         mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._renderer)
         return np.flipud(self._pixels).copy()
@@ -158,15 +199,15 @@ class GLPainter:
         self._context.free()
 
 
-def _furnished(footage: Footage, width: int, height: int) -> mujoco.MjSpec:
-    """The model of the film's arena, with light for a picture."""
-    spec = build_spec(footage.task.robot, footage.task.arena)
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+def _furnished(task: Task, view: View) -> mujoco.MjSpec:
+    """The model of the task's arena, with light for a picture."""
+    spec = build_spec(task.robot, task.arena)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = view.width, view.height
     spec.visual.quality.offsamples, spec.visual.quality.shadowsize = 4, 2048
     spec.visual.headlight.ambient = [0.38, 0.38, 0.40]
     spec.visual.headlight.diffuse = [0.18, 0.18, 0.18]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    x, y, half_x, half_y = extent(footage)
+    x, y, half_x, half_y = view.extent
     # MuJoCo's shadows of a directional light are sound well within this distance only
     spec.stat.center, spec.stat.extent = [x, y, 0.0], max(30.0, 4 * half_x, 4 * half_y)
     spec.visual.map.znear, spec.visual.map.zfar, spec.visual.map.shadowclip = 0.03, 8.0, 1.0
@@ -182,52 +223,42 @@ def _furnished(footage: Footage, width: int, height: int) -> mujoco.MjSpec:
     return spec
 
 
-def smooth_way(footage: Footage, seconds: float = 1.0) -> np.ndarray:
-    """Where a following camera looks after each control step, [T + 1, 2] in m: the torso's mean over a while."""
-    half = max(1, round(seconds / footage.control_dt / 2))
-    padded = np.pad(footage.qpos[:, :2].astype(np.float64), ((half, half), (0, 0)), mode="edge")
-    sums = np.cumsum(np.concatenate([np.zeros((1, 2)), padded]), axis=0)
-    return (sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1)
-
-
-def _gl_camera(name: CameraName, footage: Footage, at: np.ndarray, rectangle: mujoco.MjrRect) -> mujoco.MjvCamera:
+def _gl_camera(view: View, at: np.ndarray) -> mujoco.MjvCamera:
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE.value
     camera.azimuth = 90.0
-    if name == "follow":
+    if view.camera == "follow":
         camera.lookat[:] = (*at, 0.3)
         camera.distance, camera.elevation = _FOLLOW_DISTANCE, -42.0
         return camera
-    x, y, half_x, half_y = extent(footage, margin=_MARGIN)
-    camera.elevation = -89.9 if name == "above" else -58.0
-    room = 0.0 if name == "above" else 0.13 * half_y  # below, for the caption
+    x, y, half_x, half_y = view.extent
+    above = view.camera == "above"
+    camera.elevation = -89.9 if above else -58.0
+    room = 0.0 if above else 0.13 * half_y  # below, for the caption
     camera.lookat[:] = (x, y - room, 0.0)
-    tall = half_y if name == "above" else 0.9 * half_y + 0.6 + room
+    tall = half_y if above else 0.9 * half_y + 0.6 + room
     half_view = np.tan(np.radians(45.0) / 2)  # MuJoCo's vertical field of view is 45 degrees
-    camera.distance = max(tall, half_x * rectangle.height / rectangle.width) / half_view
+    camera.distance = max(tall, half_x * view.height / view.width) / half_view
     return camera
 
 
-def _add_path(scene: mujoco.MjvScene, footage: Footage, step: int) -> None:
-    knots = [*range(0, step, _CURVE_STEPS), step]
-    for a, b in pairwise(knots):
-        along = (footage.qpos[b, :2] - footage.qpos[a, :2]).astype(np.float64)
+def _add_path(scene: mujoco.MjvScene, path: Sequence[Piece]) -> None:
+    for start, end, colour in path:
+        along = (end - start).astype(np.float64)
         length = float(np.hypot(*along))
         if length < 1e-6:
             continue
-        middle = footage.qpos[[a, b], :2].mean(axis=0)
+        middle = (start + end) / 2
         (x, y), size = along / length, (length / 2 + 0.6 * _PATH_HALF_WIDTH, _PATH_HALF_WIDTH, 0.003)
-        tint = tuple(0.85 * channel for channel in colour_of(int(footage.choice[a])))
+        tint = tuple(0.85 * channel for channel in colour)
         geom = _new_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, tint, size, (*middle, 0.004))
         geom.mat = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _add_goal(scene: mujoco.MjvScene, footage: Footage) -> None:
-    if not footage.has_goal:
-        return
-    (x, y), colour = footage.goal.astype(np.float64), rgb(GOAL_COLOUR)
+def _add_goal(scene: mujoco.MjvScene, goal: np.ndarray, radius: float) -> None:
+    (x, y), colour = goal, rgb(GOAL_COLOUR)
     for kind, size, height in (
-        (mujoco.mjtGeom.mjGEOM_CYLINDER, (footage.task.goal_radius, 0.01, 0.0), 0.01),
+        (mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, 0.01, 0.0), 0.01),
         (mujoco.mjtGeom.mjGEOM_CAPSULE, (0.04, 1.2, 0.0), 1.2),
         (mujoco.mjtGeom.mjGEOM_SPHERE, (0.18, 0.0, 0.0), 2.5),
     ):
@@ -253,30 +284,28 @@ class SketchPainter:
 
     _FINER = 2  # drawn so much larger, then reduced: soft edges
 
-    def __init__(self, footage: Footage, width: int, height: int, camera: CameraName):
-        self._footage, self._size = footage, (width, height)
-        self._pose = _Pose(footage, build_spec(footage.task.robot, footage.task.arena))
-        self._follows = camera == "follow"
-        x, y, half_x, half_y = extent(footage, margin=_MARGIN)
-        fit = min(width / half_x, height / half_y) / 2
-        self._scale = self._FINER * (height / _FOLLOW_DISTANCE if self._follows else fit)  # pixels per m
-        self._way = smooth_way(footage) if self._follows else np.full((footage.num_steps + 1, 2), (x, y))
+    def __init__(self, task: Task, view: View):
+        self._task, self._size = task, (view.width, view.height)
+        self._pose = _Pose(build_spec(task.robot, task.arena))
+        x, y, half_x, half_y = view.extent
+        follows = view.camera == "follow"
+        fit = min(view.width / half_x, view.height / half_y) / 2
+        self._scale = self._FINER * (view.height / _FOLLOW_DISTANCE if follows else fit)  # px per m
+        self._centre = None if follows else np.array([x, y])
 
-    def paint(self, step: int) -> np.ndarray:
+    def paint(self, shot: Shot) -> np.ndarray:
         image = Image.new("RGB", (self._FINER * self._size[0], self._FINER * self._size[1]), _byte(_BACKGROUND))
-        pen, at = ImageDraw.Draw(image), self._way[step]
-        tint = self._pose.at(step)
+        pen, at = ImageDraw.Draw(image), shot.look_at if self._centre is None else self._centre
+        self._pose.take(shot.qpos, shot.tint)
         self._draw_floor(pen, at)
-        arena, footage = self._footage.task.arena, self._footage
-        for wall in arena.walls:
+        for wall in self._task.arena.walls:
             corners = [(wall.x - wall.half_x, wall.y + wall.half_y), (wall.x + wall.half_x, wall.y - wall.half_y)]
             pen.rectangle([self._pixel(corner, at) for corner in corners], fill=_byte(_WALL))
-        if footage.has_goal:
-            self._disc(pen, footage.goal, footage.task.goal_radius or 0.5, at, _byte(rgb(GOAL_COLOUR)))
-        for i in range(0, step, 2):
-            ends = (footage.qpos[i, :2], footage.qpos[min(i + 2, step), :2])
-            self._limb(pen, *ends, _PATH_HALF_WIDTH, at, colour_of(int(footage.choice[i])))
-        self._draw_ant(pen, at, tint)
+        if shot.goal is not None:
+            self._disc(pen, shot.goal, self._task.goal_radius or _GOAL_RADIUS, at, _byte(rgb(GOAL_COLOUR)))
+        for start, end, colour in shot.path:
+            self._limb(pen, start, end, _PATH_HALF_WIDTH, at, colour)
+        self._draw_ant(pen, at, shot.tint)
         return np.asarray(image.resize(self._size, Image.Resampling.BOX))
 
     def _draw_floor(self, pen: ImageDraw.ImageDraw, at: np.ndarray) -> None:
@@ -288,7 +317,7 @@ class SketchPainter:
                 shade = 0.80 if line % 4 == 0 else 0.89
                 pen.line([self._pixel(low, at), self._pixel(high, at)], fill=_byte((shade,) * 3), width=self._FINER)
 
-    def _draw_ant(self, pen: ImageDraw.ImageDraw, at: np.ndarray, tint: tuple[float, float, float]) -> None:
+    def _draw_ant(self, pen: ImageDraw.ImageDraw, at: np.ndarray, tint: Colour) -> None:
         model, data = self._pose.model, self._pose.data
         ant = [number for number in range(model.ngeom) if model.geom_bodyid[number] > 0]
         for number in sorted(ant, key=lambda geom: data.geom_xpos[geom, 2]):
@@ -317,6 +346,51 @@ class SketchPainter:
 
     def close(self) -> None:
         """Nothing is held."""
+
+
+class FilmPainter:
+    """Paints the moments of one filmed episode.
+
+    Args:
+        footage: the episode.
+        width: px.
+        height: px.
+        camera: as in :class:`View`.
+        platform: OpenGL's, or None.
+    """
+
+    def __init__(self, footage: Footage, width: int, height: int, camera: CameraName, platform: str | None):
+        x, y, half_x, half_y = extent(footage, margin=_MARGIN)
+        pieces = -(-footage.num_steps // _PIECE_STEPS)
+        self._footage, self._way = footage, smooth_way(footage)
+        view = View(width, height, camera, (x, y, half_x, half_y), pieces)
+        self._painter = painter(footage.task, view, platform)
+
+    def paint(self, step: int) -> np.ndarray:
+        """The moment after ``step`` control steps, [height, width, 3] uint8."""
+        footage = self._footage
+        tint = colour_of(int(footage.choice[max(step - 1, 0)]))
+        goal = footage.goal if footage.has_goal else None
+        return self._painter.paint(Shot(footage.qpos[step], tint, goal, self._path(step), self._way[step]))
+
+    def _path(self, step: int) -> list[Piece]:
+        places, choice = self._footage.qpos[:, :2], self._footage.choice
+        return [
+            (places[i], places[min(i + _PIECE_STEPS, step)], colour_of(int(choice[i])))
+            for i in range(0, step, _PIECE_STEPS)
+        ]
+
+    def close(self) -> None:
+        """Give back what the painter holds."""
+        self._painter.close()
+
+
+def smooth_way(footage: Footage, seconds: float = 1.0) -> np.ndarray:
+    """Where a following camera looks after each control step, [T + 1, 2] in m: the torso's mean over a while."""
+    half = max(1, round(seconds / footage.control_dt / 2))
+    padded = np.pad(footage.qpos[:, :2].astype(np.float64), ((half, half), (0, 0)), mode="edge")
+    sums = np.cumsum(np.concatenate([np.zeros((1, 2)), padded]), axis=0)
+    return (sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1)
 
 
 def _byte(colour: tuple[float, ...]) -> tuple[int, ...]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from footwork.doors.settings import Setting, bounds, term_names
 from footwork.env import Env, Environment, EnvState
+from footwork.footage import NOBODY
 from footwork.options import Options, OptionsState, task_state
 from footwork.physics import DEFAULT_ENGINE, physics_for
 from footwork.tasks.task import Task
@@ -117,6 +118,13 @@ class Rows:
     def goal(self) -> np.ndarray:
         """Where each row is to go, [N, 2] in m."""
         return np.array(self._inner.goal)[: self._num_envs]
+
+    @property
+    def choice(self) -> np.ndarray:
+        """Direction of the sub-policy at work in each row, [N]; :data:`~footwork.footage.NOBODY` where none is."""
+        if isinstance(self._state, OptionsState):
+            return np.array(self._state.choice)[: self._num_envs]
+        return np.full(self._num_envs, NOBODY if self._setting.direction is None else self._setting.direction)
 
     def restart(self, mask: np.ndarray, keys: np.ndarray) -> np.ndarray:
         """A new episode in the masked rows: their observations, [masked, D].

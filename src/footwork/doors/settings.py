@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from footwork.arena import DIRECTIONS, Arena, Point, bandit, maze, shortest_path
-from footwork.doors.policies import find_policies
+from footwork.doors.policies import NOWHERE, find_policies
 from footwork.options import SubPolicies
 from footwork.robot import JOINT_NAMES, ROBOTS, Robot
 from footwork.study.experiments import ANT_BANDIT, ANT_MAZE, ANT_WALKER, find_row, read_maze
-from footwork.study.runs import packaged
+from footwork.study.runs import find_needed, packaged
 from footwork.tasks.observe import JOINT_SPEED_SCALE, OBS_CLIP, VELOCITY_SCALE
 from footwork.tasks.task import FallRule, Task
 from footwork.tasks.terms import FREE_WEIGHTS, PENALISED_WEIGHTS, RewardWeights
@@ -78,8 +80,6 @@ class Setting:
 
     def at_most(self, steps: int) -> Setting:
         """The setting with episodes of no more than ``steps`` steps of the environment."""
-        if steps < 1:
-            raise ValueError(f"max_episode_steps must be >= 1, got {steps}")
         length = min(self.task.episode_steps, steps * self.option_steps)
         return replace(self, task=replace(self.task, episode_steps=length))
 
@@ -203,7 +203,7 @@ def ant_maze(
 
 
 def ant_maze_options(
-    sub_policies: str | SubPolicies = MASTER_SUB_POLICIES,
+    sub_policies: str | Path | SubPolicies = MASTER_SUB_POLICIES,
     option_steps: int = MASTER_STEPS,
     deterministic_sub_policies: bool = False,
     potential: Potential = "geodesic",
@@ -216,7 +216,8 @@ def ant_maze_options(
     The defaults are those of the study's rows ``maze/hrl/*``.
 
     Args:
-        sub_policies: a row (the packaged one is preferred), a folder made by ``footwork export``, or the policies.
+        sub_policies: a row (the packaged one is preferred), the folder of a run or of ``footwork export``, or the
+            policies. Of a master, those that it stands on.
         option_steps: control steps per choice, the paper's k.
         deterministic_sub_policies: they act by their mode instead of a sample.
         potential: progress along the straight line, or around the walls (for one goal).
@@ -225,8 +226,12 @@ def ant_maze_options(
         **maze_fields: the other fields of :func:`ant_maze`.
     """
     setting = ant_maze(potential=potential, goal_reward=goal_reward, xy_scale=xy_scale, **maze_fields)
+    if isinstance(sub_policies, str | Path):
+        sub_policies = _load(str(sub_policies), setting.task.robot)
     if not isinstance(sub_policies, SubPolicies):
-        sub_policies = _load(sub_policies, setting.task.robot)
+        raise ValueError(
+            f"sub_policies must be a row's name, the folder of a run, or the policies, got {sub_policies!r}"
+        )
     sub_policies = _acting(sub_policies, deterministic_sub_policies)
     return replace(setting, sub_policies=sub_policies, option_steps=option_steps)
 
@@ -259,7 +264,73 @@ def read_fields(kind: str, fields: Mapping[str, Any]) -> Setting:
     unknown = [name for name in fields if name not in known]
     if unknown:
         raise TypeError(f"{kind} has no field {', '.join(map(repr, unknown))}; its fields: {', '.join(known)}")
-    return MAKERS[kind](**fields)
+    return MAKERS[kind](**{name: _checked(name, value) for name, value in fields.items()})
+
+
+# What a value must be, by the name of its field: a kind, and whether None will do. Other fields check themselves.
+_KINDS: dict[str, tuple[str, bool]] = {
+    "episode_steps": ("count", False),
+    "option_steps": ("count", False),
+    "half_size": ("length", False),
+    "goal_radius": ("length", True),
+    "xy_scale": ("length", False),
+    "cell": ("length", True),
+    "start_noise": ("distance", True),
+    "goal_reward": ("number", False),
+    "penalties": ("switch", False),
+    "goal_conditioned": ("switch", False),
+    "deterministic_sub_policies": ("switch", False),
+    "direction": ("word", False),
+    "robot": ("word", False),
+    "potential": ("word", False),
+    "reward": ("word", False),
+    "fall_rule": ("word", False),
+}
+_WANTED = {
+    "count": "a whole number >= 1",
+    "length": "a finite number > 0",
+    "distance": "a finite number >= 0",
+    "number": "a finite number",
+    "switch": "True or False",
+    "word": "a word",
+}
+
+
+def _checked(name: str, value: Any) -> Any:
+    """The value as Python's own int, float, bool or str.
+
+    Raises:
+        ValueError: it is of another kind, or out of range.
+    """
+    kind, may_be_none = _KINDS.get(name, ("", False))
+    if not kind or (value is None and may_be_none):
+        return value
+    read = _READERS[kind](value)
+    if read is None:
+        other = ", or None" if may_be_none else ""
+        raise ValueError(f"{name} must be {_WANTED[kind]}{other}, got {value!r}")
+    return read
+
+
+def _read_number(value: Any, lowest: float = -math.inf, open_below: bool = False) -> float | None:
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not math.isfinite(value):
+        return None
+    return None if value < lowest or (open_below and value == lowest) else float(value)
+
+
+def _read_count(value: Any) -> int | None:
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    return int(value) if whole and value >= 1 else None
+
+
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "count": _read_count,
+    "length": lambda value: _read_number(value, 0.0, open_below=True),
+    "distance": lambda value: _read_number(value, 0.0),
+    "number": _read_number,
+    "switch": lambda value: bool(value) if isinstance(value, bool | np.bool_) else None,
+    "word": lambda value: str(value) if isinstance(value, str) else None,
+}
 
 
 @lru_cache(maxsize=64)  # the same object for the same policies: what is compiled for them is shared
@@ -274,13 +345,16 @@ def _packaged(address: str) -> tuple[Experiment, SubPolicies | None]:
 
 def _found(address: str) -> tuple[Experiment, SubPolicies | None]:
     trained = find_policies(address)
+    trained = find_needed(trained, NOWHERE) or trained  # of a master, what it chooses among
     return trained.experiment, trained.sub_policies() if trained.experiment.is_walker else None
 
 
 def _load(address: str, robot: Robot) -> SubPolicies:
     experiment, sub_policies = (_packaged if packaged(address).is_file() else _found)(address)
     if sub_policies is None:
-        raise ValueError(f"sub_policies must walk in four directions (walker/...), got {experiment.name}")
+        raise ValueError(
+            f"sub_policies must walk in four directions (walker/..., or a master's), got {experiment.name}"
+        )
     if experiment.task.robot != robot:
         raise ValueError(f"the environment has ant {robot.name!r}, {address} is for {experiment.task.robot.name!r}")
     return sub_policies
@@ -295,13 +369,18 @@ def _robot(name: str) -> Robot:
 def _weighed(task: Task, reward_weights: Mapping[str, float] | None) -> Task:
     if not reward_weights:
         return task
+    if not isinstance(reward_weights, Mapping):
+        raise ValueError(f"reward_weights must be weights by name, got {reward_weights!r}")
     known = [field.name for field in fields(RewardWeights)]
     unknown = [name for name in reward_weights if name not in known]
     if unknown:
         raise ValueError(f"unknown reward_weights {', '.join(map(repr, unknown))}; known: {', '.join(known)}")
-    changed = {name: float(value) for name, value in reward_weights.items()}
-    if not np.isfinite(list(changed.values())).all():
-        raise ValueError(f"reward_weights must be finite, got {dict(reward_weights)}")
+    changed = {}
+    for name, value in reward_weights.items():
+        weight = _read_number(value)
+        if weight is None:
+            raise ValueError(f"reward_weights[{name!r}] must be a finite number, got {value!r}")
+        changed[name] = weight
     return replace(task, weights=replace(task.weights, **changed))
 
 

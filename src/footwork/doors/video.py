@@ -14,11 +14,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 from footwork.arena import DIRECTIONS
 from footwork.checkpoint import write_atomically
-from footwork.doors.render import CameraName, choose_platform, colour_of, painter
+from footwork.doors.render import CameraName, FilmPainter, choose_platform, colour_of
 from footwork.doors.replay import OUTCOMES
 from footwork.footage import NOBODY, Footage
 
 SUFFIXES = (".mp4", ".webp", ".gif")
+MOST_PIXELS = 4096  # of a picture each way: what renderers have room for
+WEBP_PIXELS = 16383  # the format's own limit, for all pictures side by side
+FASTEST = 1000.0
 HOLD_SECONDS = 1.0  # the last picture stays
 
 _INK = (35, 38, 43)
@@ -48,12 +51,12 @@ class Look:
 
     def __post_init__(self) -> None:
         for field in ("width", "height"):
-            if getattr(self, field) < 32 or getattr(self, field) % 2:
-                raise ValueError(f"{field} must be even and >= 32, got {getattr(self, field)}")
+            if not 32 <= getattr(self, field) <= MOST_PIXELS or getattr(self, field) % 2:
+                raise ValueError(f"{field} must be even and in 32..{MOST_PIXELS}, got {getattr(self, field)}")
         if not 1 <= self.fps <= 120:
             raise ValueError(f"fps must be in 1..120, got {self.fps}")
-        if not self.speed > 0:
-            raise ValueError(f"speed must be > 0, got {self.speed}")
+        if not 0 < self.speed <= FASTEST:
+            raise ValueError(f"speed must be > 0 and <= {FASTEST:g}, got {self.speed}")
         if self.camera not in ("follow", "arena", "above"):
             raise ValueError(f"camera must be follow, arena or above, got {self.camera!r}")
         if not 1 <= self.quality <= 100:
@@ -107,6 +110,11 @@ def video(
     if not footage:
         raise ValueError("footage must hold at least one episode, got none")
     look = look or Look()
+    if suffix == ".webp" and look.width * len(footage) > WEBP_PIXELS:
+        raise ValueError(
+            f"a WebP is at most {WEBP_PIXELS} px wide, and {len(footage)} episodes of {look.width} px are more: "
+            "make them narrower, or another kind of file"
+        )
     platform, reason = choose_platform()
     if platform is None:
         report(f"drawn from above with a pen, there being no OpenGL here ({reason})")
@@ -133,7 +141,7 @@ def _pictures(footage: Sequence[Footage], look: Look, platform: str | None) -> I
     longest = max(episode.num_steps for episode in footage)
     per_picture = look.speed / (look.fps * footage[0].control_dt)  # control steps
     count = int(np.ceil(longest / per_picture)) + 1
-    painters = [painter(episode, look.width, look.height, look.camera, platform) for episode in footage]
+    painters = [FilmPainter(episode, look.width, look.height, look.camera, platform) for episode in footage]
     try:
         for number in range(count):
             step = min(round(number * per_picture), longest)

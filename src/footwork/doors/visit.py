@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from footwork.arena import CLEARANCE, DIRECTIONS, MAZES, Arena, inside_walls, maze
+from footwork.arena import CLEARANCE, DIRECTIONS, MAZES, Arena, Point, inside_walls, maze
 from footwork.doors.live import Ant, Lesson, Master, Planner
 from footwork.doors.replay import arena_extent
 from footwork.physics import DEFAULT_ENGINE
@@ -24,8 +24,27 @@ SQUARE = "square"  # the open field with a goal at a corner: the bandit's
 MAX_CELLS = 13  # of a drawn maze, each way
 LESSON_STEPS = 1_000_000  # control steps
 FRAMES_PER_SECOND = 1 / 0.033  # two control steps each
+KEPT_SECONDS = 10.0  # that a visitor may be away before somebody who waits gets the seat
 _LESSON_PERIOD = 0.5  # s between reports of a lesson
 _PACES = (0.25, 4.0)
+
+
+@dataclass(eq=False)
+class Seat:
+    """A visitor's place in the house, kept while the visitor is away and nobody else wants it.
+
+    Args:
+        token: by which the visitor's page finds it again.
+        connection: of the page that shows the visit; None while no page does.
+        visit: once it has begun.
+        left_at: when the last page went, on the monotonic clock, s.
+    """
+
+    token: str
+    connection: object | None
+    visit: Visit | None = None
+    left_at: float = 0.0
+    here: threading.Lock = field(default_factory=threading.Lock)  # held by the thread that steps the visit
 
 
 @dataclass(frozen=True)
@@ -44,8 +63,57 @@ class House:
     seats: int = 2
     lesson_steps: int = LESSON_STEPS
     closing: threading.Event = field(default_factory=threading.Event)
-    taken: list[str] = field(default_factory=list)
+    taken: list[Seat] = field(default_factory=list)
+    waiting: list[object] = field(default_factory=list)  # connections, in the order in which they came
     lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def sit(self, token: str, connection: object) -> tuple[Seat | None, int]:
+        """Take a seat: one's own of before, or a free one when it is one's turn.
+
+        Returns:
+            The seat; or None, and how many wait before this visitor.
+        """
+        with self.lock:
+            seat = next((seat for seat in self.taken if seat.token == token), None)
+            if seat is not None:
+                seat.connection = connection  # a page that still shows it lets go
+                return seat, 0
+            if connection not in self.waiting:
+                self.waiting.append(connection)
+            before = self.waiting.index(connection)
+            abandoned = None if len(self.taken) < self.seats else self._abandoned()
+            if before > 0 or (len(self.taken) >= self.seats and abandoned is None):
+                return None, before
+            seat = Seat(token, connection)
+            self.taken.append(seat)
+        if abandoned is not None:
+            self.dismiss(abandoned)
+        return seat, 0
+
+    def _abandoned(self) -> Seat | None:
+        """The seat of the one who is away for the longest time, if that is long enough to lose it."""
+        away = [seat for seat in self.taken if seat.connection is None]
+        seat = min(away, key=lambda seat: seat.left_at, default=None)
+        return None if seat is None or time.monotonic() - seat.left_at < KEPT_SECONDS else seat
+
+    def stand_up(self, connection: object) -> None:
+        """Wait no more."""
+        with self.lock:
+            if connection in self.waiting:
+                self.waiting.remove(connection)
+
+    def dismiss(self, seat: Seat) -> None:
+        """End a visit and free its seat."""
+        with self.lock:
+            if seat in self.taken:
+                self.taken.remove(seat)
+        if seat.visit is not None:
+            seat.visit.leave()
+
+    def empty(self) -> None:
+        """End all visits, those whose pages are gone too."""
+        for seat in list(self.taken):
+            self.dismiss(seat)
 
 
 class Visit:
@@ -74,11 +142,11 @@ class Visit:
         self.lesson_leads = False  # once it can
         self.ants: list[Ant] = []
         self.masters: list[Master | None] = []
-        self._planner: tuple[tuple[float, float], Planner] | None = None
+        self._planner: tuple[Point, Planner] | None = None
         self._recent: list[tuple[float, int]] = []
         self._reported = 0.0
         self._behind = 0.0
-        self.build()
+        self.build(self.arena.goals[0])
 
     # What the visitor may do: one method per message ``{"do": name, ...}`` ------------------------------------
 
@@ -138,8 +206,7 @@ class Visit:
         known = [*known_walkers(self.house.runs, self.first.engine), self._given[1].experiment.name]
         if not isinstance(rows, list) or not 1 <= len(rows) <= 2 or any(row not in known for row in rows):
             raise ValueError(f"choose one or two of {', '.join(known)}; got {rows!r}")
-        self.rows = list(rows)
-        self.build()
+        self.move_to(rows=list(rows))
 
     def do_arena(self, name: str) -> None:
         """Another maze with a name, or the open square."""
@@ -149,7 +216,7 @@ class Visit:
             arena = MAZES[name]
         else:
             raise ValueError(f"no maze {name!r}; there are {', '.join((SQUARE, *MAZES))}")
-        self.enter(arena)
+        self.move_to(arena=arena, drawn=False)
 
     def do_maze(self, rows: Any) -> None:
         """A maze that was drawn; it is checked as every maze is."""
@@ -157,7 +224,7 @@ class Visit:
             raise ValueError("a drawn maze is a list of rows of # . r g")
         if max([len(rows), *map(len, rows)]) > MAX_CELLS:
             raise ValueError(f"a drawn maze has at most {MAX_CELLS} cells each way")
-        self.enter(maze(rows, name="drawn"), drawn=True)
+        self.move_to(arena=maze(rows, name="drawn"), drawn=True)
 
     def do_train(self) -> None:
         """Let a master learn this place, from nothing, on the first sub-policies."""
@@ -171,7 +238,7 @@ class Visit:
         experiment = replace(row, task=replace(row.task, arena=arena), total_steps=self.house.lesson_steps)
         self.lesson, self.lesson_arena = Lesson(experiment, self.find_sub_policies(self.rows[0])), self.arena
         self.lesson_leads, self._reported = True, 0.0
-        self.tell({"is": "lesson", "fresh": True, **self.lesson.report()})
+        self._report_lesson(fresh=True)
 
     def do_stop(self) -> None:
         """End the lesson; what was learned stays."""
@@ -184,7 +251,7 @@ class Visit:
         """A line on the page."""
         self.tell({"is": "word", "text": text, "bad": bad, "stays": stays})
 
-    def goal(self) -> tuple[float, float]:
+    def goal(self) -> Point:
         """Where it is now, m."""
         if not self.ants:
             return self.arena.goals[0]
@@ -231,28 +298,35 @@ class Visit:
             return None
         return Master.of(trained) if trained.experiment.task.arena == self.arena else None
 
-    def enter(self, arena: Arena, drawn: bool = False) -> None:
-        """Go to another place."""
-        if self.lesson is not None:
+    def move_to(self, **changes: Any) -> None:
+        """Change the place (``arena``, ``drawn``) or the sub-policies (``rows``); if that fails, all stays as it is."""
+        kept = ("rows", "arena", "drawn", "ants", "masters", "who", "_planner")
+        before, goal = {name: getattr(self, name) for name in kept}, self.goal()
+        vars(self).update(changes)
+        try:
+            self.build(goal if self.arena == before["arena"] else self.arena.goals[0])
+        except Exception:
+            for ant in self.ants:
+                if ant not in before["ants"]:
+                    ant.close()
+            vars(self).update(before)
+            self.tell(self.scene())
+            raise
+        for ant in before["ants"]:
+            ant.close()
+        if self.lesson is not None and self.arena != before["arena"]:
             self.lesson.stop()
-        self.arena, self.drawn = arena, drawn
-        self._planner = None
-        self._dismiss_ants()
-        self.build()
 
-    def build(self) -> None:
-        """The ants anew, after their place or their sub-policies changed."""
+    def build(self, goal: Point) -> None:
+        """New ants for the place and the sub-policies that there are now; the old ones are left to the caller."""
         self.say("preparing the ants …", stays=True)
-        task = replace(self.master_row().task, arena=self.arena)
-        steps = self.master_row().option_steps
-        goal, engine = self.goal(), self.first.engine
-        self._dismiss_ants()
-        for seed, row in enumerate(self.rows):
-            self.ants.append(Ant(self.find_sub_policies(row), task, steps, seed, engine))
-        self.masters = [self.find_master(row) for row in self.rows]
-        if goal in self.arena.goals and not self.on_square():
-            goal = self.arena.goals[0]
-        self.do_goal_quietly(goal)
+        row = self.master_row()
+        task = replace(row.task, arena=self.arena)
+        self.ants = []
+        for seed, name in enumerate(self.rows):
+            self.ants.append(Ant(self.find_sub_policies(name), task, row.option_steps, seed, self.first.engine))
+        self.masters = [self.find_master(name) for name in self.rows]
+        self._put_goal(goal)
         if self.who not in self.leaders():
             self.who = "planner"
         if self.who == "planner" and any(self.masters) and goal in self.arena.goals:
@@ -261,12 +335,7 @@ class Visit:
             ant.step(leader)  # compiles
         self.tell(self.scene())
 
-    def _dismiss_ants(self) -> None:
-        for ant in self.ants:
-            ant.close()
-        self.ants = []
-
-    def do_goal_quietly(self, goal: tuple[float, float]) -> None:
+    def _put_goal(self, goal: Point) -> None:
         """All ants with one goal, and the way there."""
         self._planner = (goal, Planner.to(self.arena, goal))
         for ant in self.ants:
@@ -321,9 +390,27 @@ class Visit:
         """Twice a second, how the lesson goes."""
         if self.lesson is None or time.monotonic() - self._reported < _LESSON_PERIOD:
             return
+        running = self._report_lesson(fresh=False)
+        self._reported = time.monotonic() if running else np.inf
+
+    def _report_lesson(self, fresh: bool) -> bool:
+        """Tell of the lesson, from its beginning if the page knows nothing of it; tells whether it goes on."""
+        assert self.lesson is not None
         report = self.lesson.report()
-        self.tell({"is": "lesson", "fresh": False, **report})
-        self._reported = time.monotonic() if report["running"] else np.inf
+        if self.lesson_arena != self.arena:
+            report["ways"] = []  # they were walked in another place
+        curve = {"curve": self.lesson.curve()} if fresh else {}
+        self.tell({"is": "lesson", "fresh": fresh, **curve, **report})
+        return bool(report["running"])
+
+    def welcome_back(self, tell: Callable[[dict[str, Any]], None]) -> None:
+        """Show it all to a page that has been loaded again, or found back."""
+        self.tell = tell
+        self._behind, self._recent = 0.0, []
+        self.tell(self.scene())
+        if self.lesson is not None:
+            self._reported = 0.0
+            self._report_lesson(fresh=True)
 
     def scene(self) -> dict[str, Any]:
         """The place, for the page."""
@@ -352,15 +439,16 @@ class Visit:
             if action is None or name not in ACTIONS:
                 raise ValueError(f"the page asked for something unknown: {name!r}")
             action(**message)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, OSError) as error:
             self.say(str(error), bad=True)
 
     def leave(self) -> None:
         """End what goes on in the background."""
         if self.lesson is not None:
             self.lesson.stop()
-            self.lesson.join(10.0)
-        self._dismiss_ants()
+            self.lesson.join(60.0)  # compiling is not interrupted
+        for ant in self.ants:
+            ant.close()
 
 
 ACTIONS = (

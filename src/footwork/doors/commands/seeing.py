@@ -30,9 +30,11 @@ class _Film:
     threads: int = 0  # of the physics; 0: all cores. Changes no number
 
     def film(self) -> Filmed:
-        """The episodes, filmed."""
+        """The episodes, filmed, once it is sure that what is made of them can be written."""
+        from footwork.checkpoint import check_writable
         from footwork.doors.replay import replay
 
+        check_writable(self.to)
         return replay(
             *self.rows,
             episodes=self.episodes,

@@ -3,7 +3,17 @@
 const TRACE = 1800; // points of the way behind an ant
 const PACES = [0.25, 0.5, 1, 2, 4];
 const KEYS = { arrowright: 0, arrowup: 1, arrowleft: 2, arrowdown: 3, e: 0, n: 1, w: 2, s: 3 };
+const ELSEWHERE = 4001; // the server's code for it
 const byId = (id) => document.getElementById(id);
+
+// By which the server finds this window's visit again after the page is loaded anew.
+function visitToken() {
+  try {
+    return (sessionStorage.visit ||= crypto.randomUUID?.() ?? String(Math.random()).slice(2));
+  } catch {
+    return ""; // no storage here: every connection is a visit of its own
+  }
+}
 
 class Live extends Stage {
   constructor(world) {
@@ -100,11 +110,18 @@ class Live extends Stage {
   // ------------------------------------------------ what the server says
 
   connect() {
-    this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ants`);
-    this.socket.onmessage = (event) => this.hear(JSON.parse(event.data));
-    this.socket.onclose = () => {
-      this.say("the server is gone; trying again …", true, true);
-      setTimeout(() => this.connect(), 2000);
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    this.socket = new WebSocket(`${scheme}://${location.host}/ants?visit=${visitToken()}`);
+    let ended = ""; // the server's last word, if the visit ended with one
+    this.socket.onmessage = (event) => {
+      const message = JSON.parse(event.data);
+      ended = message.is === "word" && message.bad && message.stays ? `${message.text}; ` : "";
+      this.hear(message);
+    };
+    this.socket.onclose = (event) => {
+      if (event.code === ELSEWHERE) return; // another window shows this visit
+      this.say(`${ended || "the server is gone; "}trying again …`, true, true);
+      setTimeout(() => this.connect(), ended ? 5000 : 2000);
     };
   }
 
@@ -175,7 +192,7 @@ class Live extends Stage {
 
   onLesson(lesson) {
     const of = lesson.step / lesson.total;
-    if (lesson.fresh) this.curve = [];
+    if (lesson.fresh) this.curve = lesson.curve;
     this.learning = lesson.running;
     byId("lesson").hidden = false;
     byId("train").textContent = lesson.running ? "stop learning" : "train a master here";
@@ -184,7 +201,7 @@ class Live extends Stage {
     byId("progress").textContent = lesson.progress === null ? "–" : `${lesson.progress.toFixed(1)} m`;
     byId("learned").textContent = `${Math.round(lesson.step / 1000)} k of ${Math.round(lesson.total / 1000)} k`;
     byId("rate").textContent = lesson.rate.toLocaleString("en");
-    if (lesson.success !== null) this.curve.push([of, lesson.success]);
+    if (lesson.success !== null && !lesson.fresh) this.curve.push([of, lesson.success]);
     this.drawCurve();
     this.map.addWays(lesson.ways);
     if (lesson.error) this.say(`the lesson ended: ${lesson.error}`, true);

@@ -570,6 +570,11 @@ class Stage {
     const box = this.canvas.getBoundingClientRect(), x = event.clientX - box.left, y = event.clientY - box.top;
     const panel = this.panels.find((p) => x >= p.box.x && x <= p.box.x + p.box.w && y >= p.box.y && y <= p.box.y + p.box.h);
     if (!panel || !panel.lastPose) return;
+    if (!this.renderer) {
+      const { at, origin, zoom } = this.flatView(panel, panel.lastPose);
+      this.onFloor(panel, [at[0] + (x - origin[0]) / zoom, at[1] - (y - origin[1]) / zoom]);
+      return;
+    }
     const { eye, axes } = this.cameraOf(panel, panel.lastPose), half = Math.tan(FOV / 2), { box: b } = panel;
     const u = (((x - b.x) / b.w) * 2 - 1) * half * (b.w / b.h), v = (1 - ((y - b.y) / b.h) * 2) * half;
     const ray = plus(plus(times(axes.right, u), times(axes.top, v)), times(axes.back, -1));
@@ -578,6 +583,10 @@ class Stage {
 
   // Where a point of the floor is on the screen, [x, y] px from the canvas' corner: the other way round.
   project(panel, [x, y]) {
+    if (!this.renderer) {
+      const { at, origin, zoom } = this.flatView(panel, panel.lastPose);
+      return [origin[0] + (x - at[0]) * zoom, origin[1] - (y - at[1]) * zoom];
+    }
     const { eye, axes } = this.cameraOf(panel, panel.lastPose), half = Math.tan(FOV / 2), { box: b } = panel;
     const d = minus([x, y, 0], eye), depth = -dot3(d, axes.back);
     const u = dot3(d, axes.right) / depth / half / (b.w / b.h), v = dot3(d, axes.top) / depth / half;
@@ -740,6 +749,15 @@ class Stage {
     return this.renderer.render(this.scene(panel, pose, tint, ways), rectangle);
   }
 
+  // Without WebGL one looks straight down: the point `at` of the floor (m) is drawn at `origin` (px), `zoom` px per m.
+  flatView({ box: { x, y, w, h }, extent }, pose) {
+    const { fit, distance, shift } = this.view, half = 0.42 * distance;
+    const [cx, cy, halfX, halfY] = fit ? extent : [pose[0], pose[1], half, half];
+    const card = fit && w > 2 * CARD ? CARD : 0; // the arena stands right of the card
+    const zoom = (Math.min((w - card) / halfX, h / halfY) / 2.1) * (fit ? 10.5 / distance : 1);
+    return { at: [cx + shift[0], cy + shift[1]], origin: [x + (w + card) / 2, y + h / 2], zoom };
+  }
+
   // Without WebGL: the same from above, with the pen of the page.
   drawFlat(panel, pose, tint, pieces, scale) {
     const pen = this.pen ??= this.canvas.getContext("2d"), look = THEMES[this.theme], { x, y, w, h } = panel.box;
@@ -750,11 +768,10 @@ class Stage {
     pen.clip();
     pen.fillStyle = look.back;
     pen.fillRect(x, y, w, h);
-    const [cx, cy, halfX, halfY] = this.view.fit ? panel.extent : [pose[0], pose[1], 0.42 * this.view.distance, 0.42 * this.view.distance];
-    const zoom = Math.min(w / halfX, h / halfY) / 2.1;
-    pen.translate(x + w / 2, y + h / 2);
+    const { at, origin, zoom } = this.flatView(panel, pose);
+    pen.translate(...origin);
     pen.scale(zoom, -zoom);
-    pen.translate(-cx - this.view.shift[0], -cy - this.view.shift[1]);
+    pen.translate(-at[0], -at[1]);
     pen.fillStyle = look.wall;
     for (const [wx, wy, hx, hy] of panel.walls) pen.fillRect(wx - hx, wy - hy, 2 * hx, 2 * hy);
     if (panel.goal) {

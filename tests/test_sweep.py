@@ -18,6 +18,8 @@ from footwork.record import RunError
 from footwork.study import job, sweep
 from footwork.study.measure import measured
 from footwork.study.plan import FULL, Job, Study, plan
+from footwork.study.report import export
+from footwork.study.results import Results
 from footwork.study.runs import run_path
 
 ROWS = ("walker/plain", "walker/appropriate-bias", "maze/hrl/appropriate-bias", "walker/symmetric")
@@ -208,6 +210,13 @@ def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
     assert len(entry["ends"]) == 3
     with pytest.raises(RunError, match="needs walker/symmetric seed 2, which is not finished"):
         job.complete(study, "bandit/hrl/symmetric", 2)
+    # and elsewhere, where only the small files of the report are
+    results = Results(study)
+    assert len(results.samples("walker/symmetric")) == 2
+    export(results, tmp_path / "copy")
+    job.complete(Study(tmp_path / "copy", size), "bandit/hrl/symmetric", 1)
+    again = checkpoint.load_arrays(run_path(tmp_path / "copy", "bandit/hrl/symmetric", (1,)) / "policy.safetensors")[0]
+    assert all((again[name] == array).all() for name, array in checkpoint.load_arrays(master.policy_path)[0].items())
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="ray is installed")

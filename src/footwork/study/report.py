@@ -2,7 +2,7 @@
 
 ``REPORT.md`` with the figures beside it, and the same as one HTML page that needs nothing else. Written
 from files alone; ``results/`` beside it holds the small ones of every run that counts, enough to
-make the report again.
+make the report again, and to go on with the study.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from footwork.study.figures import FIGURES, Drawn, draw_figures
 from footwork.study.measure import EVALUATION, TRANSITIONS
 from footwork.study.plan import STUDY_FILE, read_machine
 from footwork.study.results import CURVE, METRICS, Results, write_curve
+from footwork.study.runs import save_actors
 from footwork.train import planned_steps
 
 
@@ -287,8 +288,12 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
 def export(results: Results, to: Path) -> None:
     """Copy the small files of every run that was read: enough to draw and to judge again.
 
+    And the sub-policies, without their critics: masters stand on them, so that ``footwork reproduce`` goes on from a
+    copy of this folder as it would from the runs themselves.
+
     Raises:
         OSError: they cannot be written.
+        CheckpointError: a policy is damaged, or cannot be written.
     """
     if to.resolve() == results.study.runs.resolve():
         return
@@ -304,6 +309,8 @@ def export(results: Results, to: Path) -> None:
             curve = results.whole_curve(sample)
             if curve is not None:
                 write_curve(place / CURVE, curve, None)
+            if sample.experiment.is_walker and run.policy_path.is_file():
+                save_actors(run, place / run.policy_path.name)
     if (results.study.runs / STUDY_FILE).is_file():
         shutil.copyfile(results.study.runs / STUDY_FILE, to / STUDY_FILE)
 

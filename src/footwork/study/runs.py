@@ -198,6 +198,16 @@ def load_run(run: RunDir) -> Trained:
     return load_policies(run.policy_path)
 
 
+def save_actors(run: RunDir, to: Path) -> None:
+    """Write a run's policies to another file without their critics: enough to act.
+
+    Raises:
+        CheckpointError: the policies are damaged, or the file cannot be written.
+    """
+    trained = load_run(run)
+    checkpoint.save(to, {"actor": trained.params["actor"]}, checkpoint.load_arrays(run.policy_path)[1])
+
+
 def finished_runs(row: str, runs: Path) -> list[RunDir]:
     """Finished runs that count as the row, newest first."""
     return _finished(find_row(row), runs)

@@ -168,7 +168,8 @@ def ant_maze(
     """AntMaze: reach the goal of a maze, which is not observed (unless there are several).
 
     Args:
-        maze_map: u, spiral, medium or large; rows as Gymnasium-Robotics has them; a text of several lines; a text file.
+        maze_map: u, spiral, medium or large; rows as Gymnasium-Robotics has them, with one start ("r") and one goal
+            ("g"; "c" stands for either); a text of several lines; a text file.
         goal: (x, y) in m instead of the map's; or several, one of which is drawn for each episode and observed.
         potential: progress along the straight line, or around the walls (for one goal).
         penalties: electricity, stall torque, joints at their limit and colliding feet cost.

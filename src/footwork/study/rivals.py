@@ -60,7 +60,7 @@ def ppo(library: str, task: str, num_envs: int, processes: bool) -> Measure:
     """Table 1's PPO; nets of 64-64 tanh are the default of these libraries."""
     learner = importlib.import_module(library).PPO
     if "Bullet" in task:
-        importlib.import_module("pybullet_envs_gymnasium")  # registers them
+        task = f"pybullet_envs_gymnasium:{task}"  # who makes one, a process of its own too, imports what registers it
     make = importlib.import_module("stable_baselines3.common.env_util").make_vec_env
     kinds = importlib.import_module("stable_baselines3.common.vec_env")
     envs = make(task, num_envs, seed=0, vec_env_cls=kinds.SubprocVecEnv if processes else kinds.DummyVecEnv)

@@ -9,10 +9,9 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 
-from footwork.doors.render import Shot, View, choose_platform, colour_of, painter
+from footwork.doors.render import Shot, View, choose_platform, colour_of, furnished, painter
 from footwork.doors.replay import arena_extent
 from footwork.footage import NOBODY
-from footwork.physics.mjcf import build_spec
 from footwork.study.palette import GOAL_COLOUR, rgb
 from footwork.tasks.task import Task
 
@@ -43,12 +42,16 @@ def shower(task: Task, render_mode: str) -> Shower:
     return _Camera(task, platform)
 
 
+def _view(task: Task) -> View:
+    x, y, half_x, half_y = arena_extent(task.arena, np.array([task.arena.start]))
+    return View(WIDTH, HEIGHT, "follow", (x, y, half_x, half_y))
+
+
 class _Camera:
     """Follows the ant."""
 
     def __init__(self, task: Task, platform: str | None):
-        x, y, half_x, half_y = arena_extent(task.arena, np.array([task.arena.start]))
-        self._painter = painter(task, View(WIDTH, HEIGHT, "follow", (x, y, half_x, half_y)), platform)
+        self._painter = painter(task, _view(task), platform)
 
     def draw(self, qpos: np.ndarray, goal: np.ndarray | None, choice: int = NOBODY) -> np.ndarray:
         return self._painter.paint(Shot(qpos, colour_of(choice), goal, (), qpos[:2].astype(np.float64)))
@@ -61,7 +64,7 @@ class _Window:
     """MuJoCo's viewer; the camera is the user's."""
 
     def __init__(self, task: Task):
-        spec = build_spec(task.robot, task.arena)
+        spec = furnished(task, _view(task))
         marker = spec.worldbody.add_body(name="goal", mocap=True, pos=[0.0, 0.0, -5.0])
         marker.add_geom(
             name="goal",
@@ -73,7 +76,9 @@ class _Window:
         )
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._viewer = mujoco.viewer.launch_passive(self._model, self._data)
+        self._viewer = mujoco.viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        with self._viewer.lock():  # where the user's camera begins
+            self._viewer.cam.distance, self._viewer.cam.azimuth, self._viewer.cam.elevation = 10.0, 90.0, -45.0
 
     def draw(self, qpos: np.ndarray, goal: np.ndarray | None, choice: int = NOBODY) -> None:
         with self._viewer.lock():

@@ -168,7 +168,7 @@ class GLPainter:
         self._context = importlib.import_module(f"mujoco.{platform}").GLContext(view.width, view.height)
         self._context.make_current()
         self._task, self._view = task, view
-        self._pose = _Pose(_furnished(task, view))
+        self._pose = _Pose(furnished(task, view))
         self._scene = mujoco.MjvScene(self._pose.model, maxgeom=2000 + view.most_pieces)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = True
@@ -199,7 +199,7 @@ class GLPainter:
         self._context.free()
 
 
-def _furnished(task: Task, view: View) -> mujoco.MjSpec:
+def furnished(task: Task, view: View) -> mujoco.MjSpec:
     """The model of the task's arena, with light for a picture."""
     spec = build_spec(task.robot, task.arena)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = view.width, view.height

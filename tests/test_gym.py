@@ -273,7 +273,8 @@ def test_a_master_brings_the_sub_policies_that_it_stands_on():
 
 
 def test_frames_where_there_is_no_opengl(monkeypatch):
-    from footwork.doors import frames, render
+    from footwork import render
+    from footwork.doors import frames
 
     monkeypatch.setenv("MUJOCO_GL", "disable")
     render.choose_platform.cache_clear()

@@ -33,8 +33,8 @@ from footwork.doors.cli import run
 from footwork.doors.live import Lesson
 from footwork.doors.play import open_server
 from footwork.doors.visit import House, Visit
+from footwork.palette import DIRECTION_COLOURS, GOAL_COLOUR, rgb
 from footwork.study.experiments import find_row
-from footwork.study.palette import DIRECTION_COLOURS, GOAL_COLOUR, rgb
 from footwork.study.runs import find_trained
 from webdriver import AVAILABLE, MISSING, Browser
 

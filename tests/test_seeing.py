@@ -18,17 +18,17 @@ import pytest
 from PIL import Image
 
 import footwork.doors
-from footwork.arena import DIRECTIONS, open_field
-from footwork.doors import render
+from footwork import render
+from footwork.arena import DIRECTIONS, extent_of, open_field
 from footwork.doors.cli import run
-from footwork.doors.replay import Replay, extent, quantise
+from footwork.doors.replay import Replay, quantise
 from footwork.doors.video import Look, video
 from footwork.footage import Footage
+from footwork.palette import DIRECTION_COLOURS, rgb
 from footwork.physics.mjcf import build_model
 from footwork.physics.skeleton import skeleton
 from footwork.robot import HEAVY, ROBOTS
 from footwork.study.experiments import ANT_MAZE, ANT_WALKER
-from footwork.study.palette import DIRECTION_COLOURS, rgb
 from webdriver import AVAILABLE, MISSING, Browser
 
 VIEWER = Path(footwork.doors.__file__).parent / "viewer"
@@ -151,7 +151,7 @@ def test_the_page_says_what_was_filmed():
     assert len(maze["walls"]) == len(ANT_MAZE.arena.walls)
     assert maze["goal"] == list(ANT_MAZE.arena.goals[0])
     assert (field["goal"], field["walls"], field["odds"], field["good"]) == (None, [], "", False)
-    assert extent(shot()) == [0.0, 0.0, 7.0, 7.0]  # the maze within its border, and a metre
+    assert shot().extent() == (0.0, 0.0, 7.0, 7.0)  # the maze within its border, and a metre
 
 
 def test_text_cannot_break_out_of_the_page():
@@ -199,6 +199,37 @@ def test_bad_input_is_one_line(arguments, message, capsys, tmp_path, monkeypatch
     assert message in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_ant_stands_on_the_floor():
+    from footwork.physics import physics_for
+
+    task = ANT_MAZE
+    qpos = render.standing(task.arena.start)[None]
+    physics = physics_for("mujoco", task.robot, task.arena, 1, 1)
+    state = physics.reset(physics.initial(), np.ones(1, bool), qpos, np.zeros((1, 14), np.float32))
+    assert state.foot_contact.all()  # they touch from 2 cm on
+    assert not physics.reset(state, np.ones(1, bool), qpos + 0.05 * np.eye(15)[2], np.zeros((1, 14))).foot_contact.any()
+
+
+def test_points_are_where_they_are_rendered():
+    render.choose_platform.cache_clear()
+    platform, reason = render.choose_platform()
+    if platform is None:
+        pytest.skip(f"no OpenGL here: {reason}")
+    (x, y), (there_x, there_y) = ANT_MAZE.arena.start, ANT_MAZE.arena.goals[0]
+    view = render.View(320, 240, "arena", extent_of(ANT_MAZE.arena))
+    painter = render.GLPainter(ANT_MAZE, view, platform)
+    pose = render.standing((x, y))
+    picture = painter.paint(render.Shot(pose, (0.0, 1.0, 0.0), np.array([there_x, there_y]), (), np.zeros(2))).astype(
+        int
+    )
+    painter.close()
+    for place, colour in (((there_x - 0.3, there_y, 0.02), rgb("#D55E00")), ((x, y, pose[2]), (0.0, 1.0, 0.0))):
+        column, row = np.round(render.project(view, [place])[0]).astype(int)
+        seen = picture[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3)
+        hue = seen / np.maximum(seen.max(axis=1, keepdims=True), 1)  # in the light or in the shade
+        assert np.abs(hue - np.array(colour) / max(colour)).max(axis=1).min() < 0.2, place
 
 
 def test_the_commands_leave_a_page_and_a_video(tmp_path, capsys, monkeypatch):

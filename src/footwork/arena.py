@@ -163,6 +163,23 @@ def maze(
     )
 
 
+def extent_of(
+    arena: Arena, points: npt.ArrayLike | None = None, margin: float = 1.0
+) -> tuple[float, float, float, float]:
+    """Centre x, y and half sizes (m) of what there is to see: start, points [P, 2], and a maze within its border.
+
+    Without points the goals are seen too.
+    """
+    every = [np.array([arena.start]), np.array(arena.goals if points is None else points, np.float64)]
+    if arena.grid:
+        half = np.array([len(arena.grid[0]) - 2, len(arena.grid) - 2]) * arena.cell / 2
+        every.append(np.stack([-half, half]))
+    together = np.concatenate(every)
+    low, high = together.min(axis=0), together.max(axis=0)
+    (x, y), (half_x, half_y) = (low + high) / 2, (high - low) / 2 + margin
+    return float(x), float(y), float(half_x), float(half_y)
+
+
 def inside_walls(arena: Arena, points: npt.ArrayLike, clearance: float = 0.0) -> Bools:
     """Which of the points [..., 2] (m) are in a wall grown by ``clearance`` (m) on all four sides: bool [...]."""
     xy = np.asarray(points, dtype=np.float64)

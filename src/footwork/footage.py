@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from footwork.arena import extent_of
 from footwork.env import Environment
 from footwork.evaluate import actor, evaluation_environment, finish_step
 from footwork.learn.networks import Policy
@@ -78,6 +79,13 @@ class Footage:
     def has_goal(self) -> bool:
         """Whether the goal is a place to arrive at, and not a direction (targets 10 km away)."""
         return self.task.goal_radius is not None
+
+    def extent(self, margin: float = 1.0) -> tuple[float, float, float, float]:
+        """Centre x, y and half sizes (m) of what there is to see: path, start, goal, and a maze within its border."""
+        points = [self.qpos[:, :2].astype(np.float64)]
+        if self.has_goal:
+            points.append(self.goal[None].astype(np.float64))
+        return extent_of(self.task.arena, np.concatenate(points), margin)
 
 
 class _Frame(NamedTuple):

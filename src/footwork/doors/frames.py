@@ -9,10 +9,10 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 
-from footwork.doors.render import Shot, View, choose_platform, colour_of, furnished, painter
-from footwork.doors.replay import arena_extent
+from footwork.arena import extent_of
 from footwork.footage import NOBODY
-from footwork.study.palette import GOAL_COLOUR, rgb
+from footwork.palette import GOAL_COLOUR, rgb
+from footwork.render import Shot, View, choose_platform, colour_of, furnished, painter
 from footwork.tasks.task import Task
 
 HEIGHT, WIDTH = 480, 640  # px
@@ -43,8 +43,7 @@ def shower(task: Task, render_mode: str) -> Shower:
 
 
 def _view(task: Task) -> View:
-    x, y, half_x, half_y = arena_extent(task.arena, np.array([task.arena.start]))
-    return View(WIDTH, HEIGHT, "follow", (x, y, half_x, half_y))
+    return View(WIDTH, HEIGHT, "follow", extent_of(task.arena, [task.arena.start]))
 
 
 class _Camera:

@@ -25,8 +25,8 @@ from urllib.parse import parse_qs, urlsplit
 from footwork.arena import DIRECTIONS, MAZES
 from footwork.doors.replay import page
 from footwork.doors.visit import FRAMES_PER_SECOND, LESSON_STEPS, SQUARE, House, Seat, Visit, known_walkers
+from footwork.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.physics.skeleton import skeleton
-from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.study.runs import find_trained
 
 try:

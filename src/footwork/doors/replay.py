@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from footwork.arena import DIRECTIONS, Arena
+from footwork.arena import DIRECTIONS
 from footwork.checkpoint import write_atomically
 from footwork.footage import Footage, film
+from footwork.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.physics.skeleton import skeleton
-from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.study.runs import find_needed, find_trained
 from footwork.train import Trained, choices_of
 
@@ -187,7 +187,7 @@ def _episode(footage: Footage) -> dict[str, Any]:
         "start": arena.start,
         "goal": footage.goal.tolist() if footage.has_goal else None,
         "goal_radius": footage.task.goal_radius,
-        "extent": extent(footage),
+        "extent": list(footage.extent()),
         "low": low,
         "step": step,
         "frames": _base64(codes),
@@ -208,25 +208,6 @@ def label(footage: Footage) -> str:
     return f"seed {footage.seed}, episode {footage.episode}, {footage.task.arena.name.replace('_', ' ')}"
 
 
-def extent(footage: Footage, margin: float = 1.0) -> list[float]:
-    """Centre x, y and half sizes (m) of what there is to see: path, start, goal, and a maze within its border."""
-    points = [footage.qpos[:, :2].astype(np.float64)]
-    if footage.has_goal:
-        points.append(footage.goal[None].astype(np.float64))
-    return arena_extent(footage.task.arena, np.concatenate(points), margin)
-
-
-def arena_extent(arena: Arena, points: np.ndarray | None = None, margin: float = 1.0) -> list[float]:
-    """The same of an arena and points [P, 2] in m in it; without points its goals are seen too."""
-    every = [np.array([arena.start]), np.array(arena.goals) if points is None else points]
-    if arena.grid:
-        half = np.array([len(arena.grid[0]) - 2, len(arena.grid) - 2]) * arena.cell / 2
-        every.append(np.stack([-half, half]))
-    together = np.concatenate(every)
-    low, high = together.min(axis=0), together.max(axis=0)
-    return [*((low + high) / 2).tolist(), *((high - low) / 2 + margin).tolist()]
-
-
 def quantise(values: np.ndarray) -> tuple[list[float], list[float], np.ndarray]:
     """Columns of [T, C] in 16 bits: lower bounds [C], steps [C] and codes [T, C]; the error is half a step."""
     low = values.min(axis=0).astype(np.float64)
@@ -239,4 +220,4 @@ def _base64(array: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-__all__ = ["Replay", "arena_extent", "film_row", "film_trained", "page", "replay"]
+__all__ = ["Replay", "film_row", "film_trained", "page", "replay"]

@@ -14,9 +14,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from footwork.arena import DIRECTIONS
 from footwork.checkpoint import write_atomically
-from footwork.doors.render import CameraName, FilmPainter, choose_platform, colour_of
 from footwork.doors.replay import OUTCOMES
 from footwork.footage import NOBODY, Footage
+from footwork.render import CameraName, FilmPainter, choose_platform, colour_of
 
 SUFFIXES = (".mp4", ".webp", ".gif")
 MOST_PIXELS = 4096  # of a picture each way: what renderers have room for

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from footwork.arena import CLEARANCE, DIRECTIONS, MAZES, Arena, Point, inside_walls, maze
+from footwork.arena import CLEARANCE, DIRECTIONS, MAZES, Arena, Point, extent_of, inside_walls, maze
 from footwork.doors.live import Ant, Lesson, Master, Planner
-from footwork.doors.replay import arena_extent
 from footwork.physics import DEFAULT_ENGINE
 from footwork.study.experiments import WALKERS, find_row, with_engine
 from footwork.study.runs import find_needed, find_trained, finished_runs, packaged
@@ -425,7 +424,7 @@ class Visit:
             "start": arena.start,
             "goal": self.goal(),
             "goal_radius": 0.5,
-            "extent": arena_extent(arena),
+            "extent": list(extent_of(arena)),
             "ants": self.rows,
             "drawn": self.drawn,
         }

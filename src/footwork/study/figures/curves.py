@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from footwork.arena import DIRECTIONS, shortest_path
+from footwork.palette import DIRECTION_COLOURS
 from footwork.statistics import DRAWS, Floats, curve_band, generator_for
 from footwork.study.figures.style import empty, label_of, legend_below, look_of, panels
-from footwork.study.palette import DIRECTION_COLOURS
 from footwork.study.results import Curve, Results, Sample
 from footwork.train import Experiment
 

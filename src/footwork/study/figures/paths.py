@@ -17,10 +17,10 @@ from matplotlib.patches import Circle, Rectangle
 
 from footwork.arena import DIRECTIONS, Arena
 from footwork.evaluate import Episodes
+from footwork.palette import DIRECTION_COLOURS, FLAT_COLOUR, GOAL_COLOUR
 from footwork.study.experiments import find_row
 from footwork.study.figures.style import empty
 from footwork.study.measure import EVALUATION, STUCK_WITHIN, straight_line_stop
-from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR, GOAL_COLOUR
 from footwork.study.results import Results
 
 _WALL_COLOUR = "#4A4E57"

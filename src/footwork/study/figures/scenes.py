@@ -1,4 +1,4 @@
-"""The paper's Figures 1 to 4, drawn: the three tasks seen from above at an angle, and the hierarchy."""
+"""The paper's Figures 1 to 4: the three tasks as MuJoCo renders them, or drawn without OpenGL; and the hierarchy."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Polygon
 
-from footwork.arena import DIRECTIONS, Arena, bandit
-from footwork.study.experiments import ANT_MAZE
-from footwork.study.palette import DIRECTION_COLOURS
+from footwork.arena import DIRECTIONS, Arena, bandit, extent_of
+from footwork.palette import DIRECTION_COLOURS, rgb
+from footwork.render import GLPainter, Shot, View, choose_platform, project, standing
+from footwork.study.experiments import ANT_BANDIT, ANT_MAZE, ANT_WALKER
 from footwork.study.results import Results
+from footwork.tasks.task import Task
 
 _LEGS = ((1, 1), (-1, 1), (-1, -1), (1, -1))  # as in assets/ant.xml
 _KNEE = math.radians(62.0)  # how far the shins bend down
@@ -116,8 +118,56 @@ def _frame(ax: Any, view: _View, points: Iterable[Any], margin: float) -> None:
     ax.set_ylim(flat[:, 1].min() - margin, flat[:, 1].max() + margin)
 
 
+class _Photograph:
+    """A task's scene by MuJoCo's renderer, to be written on; coordinates are px of the picture."""
+
+    def __init__(self, task: Task, extent: tuple[float, float, float, float], size: tuple[int, int], platform: str):
+        goal = None if task.goal_radius is None else np.array(task.arena.goals[0])
+        self._view = View(*size, "arena", extent)
+        painter = GLPainter(task, self._view, platform)
+        shot = Shot(standing(task.arena.start), rgb(_LIMB), goal, (), np.array(task.arena.start))
+        picture = painter.paint(shot)
+        painter.close()
+        self.figure, self.ax = _axes((6.4, 6.4 * size[1] / size[0]))
+        self.ax.set_position((0, 0, 1, 1))
+        self.ax.imshow(picture, interpolation="lanczos")
+        self.ax.set_xlim(0, size[0])
+        self.ax.set_ylim(size[1], 0)
+
+    def at(self, *point: float) -> tuple[float, float]:
+        """Where a point (x, y, z) in m is."""
+        column, row = project(self._view, np.array([point]))[0]
+        return float(column), float(row)
+
+    def word(self, text: str, *point: float, **style: Any) -> None:
+        """Text at a point."""
+        style = {"ha": "center", "va": "center", "fontsize": 9, "weight": "bold", **style}
+        ground = {"boxstyle": "round", "fc": "white", "ec": "none", "alpha": 0.8}
+        self.ax.text(*self.at(*point), text, bbox=ground, **style)
+
+    def arrow(self, start: tuple[float, ...], end: tuple[float, ...], **style: Any) -> None:
+        """An arrow from a point to another."""
+        style = {"arrowstyle": "-|>", "mutation_scale": 15, "lw": 2.4, "shrinkA": 0, "shrinkB": 0, **style}
+        self.ax.add_patch(FancyArrowPatch(self.at(*start), self.at(*end), **style))
+
+
 def walker_scene(results: Results, rows: tuple[str, ...]) -> Any:
     """AntWalker: one of four directions, its target 10 km away."""
+    platform, _ = choose_platform()
+    return _drawn_walker() if platform is None else _photographed_walker(platform)
+
+
+def _photographed_walker(platform: str) -> Any:
+    photograph = _Photograph(ANT_WALKER, (0.6, 0.1, 2.9, 1.9), (1280, 860), platform)
+    for i, name in enumerate(DIRECTIONS):
+        unit = np.array([math.cos(i * math.pi / 2), math.sin(i * math.pi / 2)])
+        photograph.arrow((*1.0 * unit, 0.02), (*1.75 * unit, 0.02), color=DIRECTION_COLOURS[i])
+        photograph.word(name, *2.05 * unit, 0.02, color=DIRECTION_COLOURS[i])
+    photograph.word("target of “right”: (10 km, 0) →", 2.6, 0.45, 0.02, color=_GOAL, fontsize=8)
+    return photograph.figure
+
+
+def _drawn_walker() -> Any:
     figure, ax = _axes((5.6, 4.0))
     view = _View(-62.0, 38.0)
     _frame(ax, view, [(-2.6, -2.2, 0), (4.0, -2.2, 0), (4.0, 2.2, 0), (-2.6, 2.2, 0), (0, 0, 1.2)], 0.15)
@@ -136,6 +186,24 @@ def walker_scene(results: Results, rows: tuple[str, ...]) -> Any:
 
 def bandit_scene(results: Results, rows: tuple[str, ...]) -> Any:
     """AntBandit: one of four corners is the goal of the episode."""
+    platform, _ = choose_platform()
+    return _drawn_bandit() if platform is None else _photographed_bandit(platform)
+
+
+def _photographed_bandit(platform: str) -> Any:
+    photograph = _Photograph(ANT_BANDIT, (0.0, 0.0, 9.5, 8.8), (1280, 960), platform)
+    corners = [*ANT_BANDIT.arena.goals, ANT_BANDIT.arena.goals[0]]
+    photograph.ax.plot(
+        *np.array([photograph.at(*corner, 0.0) for corner in corners]).T, color="#8A8478", ls="--", lw=1.0
+    )
+    for number, (x, y) in enumerate(ANT_BANDIT.arena.goals):
+        words, height = ("this episode's goal", 3.2) if number == 0 else ("not this time", 0.0)
+        photograph.word(words, x, y, height, color=_GOAL if number == 0 else "#6A6458", fontsize=8)
+    photograph.word(f"{2 * corners[0][0]:.0f} m", 0.0, -corners[0][1], 0.0, color="#6A6458", fontsize=8)
+    return photograph.figure
+
+
+def _drawn_bandit() -> Any:
     figure, ax = _axes((5.6, 4.2))
     view, arena = _View(-70.0, 42.0), bandit()
     corners = [(x, y, 0) for x, y in arena.goals]
@@ -156,6 +224,21 @@ def bandit_scene(results: Results, rows: tuple[str, ...]) -> Any:
 
 def maze_scene(results: Results, rows: tuple[str, ...]) -> Any:
     """AntMaze: the goal lies behind a wall."""
+    platform, _ = choose_platform()
+    return _drawn_maze() if platform is None else _photographed_maze(platform)
+
+
+def _photographed_maze(platform: str) -> Any:
+    arena = ANT_MAZE.arena
+    photograph = _Photograph(ANT_MAZE, extent_of(arena), (1280, 1000), platform)
+    (start_x, start_y), (goal_x, goal_y) = arena.start, arena.goals[0]
+    photograph.word("goal", goal_x + 1.4, goal_y, 0.0, color=_GOAL)
+    photograph.word("start", start_x, start_y - 1.3, 0.0, color="#444444")
+    photograph.arrow((start_x, start_y + 0.7, 0.6), (goal_x, goal_y - 0.6, 0.6), color=_GOAL, lw=1.4, ls=":")
+    return photograph.figure
+
+
+def _drawn_maze() -> Any:
     figure, ax = _axes((5.6, 4.6))
     view, arena = _View(-74.0, 52.0), ANT_MAZE.arena
     height = 0.6 * arena.wall_height  # lower than they are, so that one sees over them

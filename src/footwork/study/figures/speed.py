@@ -7,8 +7,8 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 
+from footwork.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.study.figures.paths import write
-from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR
 
 
 def bench_figure(path: Path, report: dict[str, Any]) -> Path:

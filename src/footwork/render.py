@@ -19,10 +19,10 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw
 
-from footwork.doors.replay import extent
 from footwork.footage import Footage
+from footwork.palette import DIRECTION_COLOURS, FLAT_COLOUR, GOAL_COLOUR, rgb
 from footwork.physics.mjcf import build_spec
-from footwork.study.palette import DIRECTION_COLOURS, FLAT_COLOUR, GOAL_COLOUR, rgb
+from footwork.robot import ANKLE_SIGN
 from footwork.tasks.task import Task
 
 CameraName = Literal["follow", "arena", "above"]
@@ -33,8 +33,10 @@ _BACKGROUND = (0.955, 0.95, 0.935)
 _WALL = (0.68, 0.69, 0.72)
 _WALL_HEIGHT = 0.5  # m, as drawn: walls of 2 m would hide the ant
 _MARGIN = 0.6  # m
+_SHIN_LENGTH, _LIMB_RADIUS = 0.4 * 2**0.5, 0.08  # m, as in assets/ant.xml
 _GOAL_RADIUS = 0.5  # m, as drawn where nothing ends an episode
 _FOLLOW_DISTANCE = 8.0  # m
+_FIELD_OF_VIEW = 45.0  # degrees, vertical: MuJoCo's own
 _PATH_HALF_WIDTH = 0.06  # m
 _PIECE_STEPS = 4  # control steps per piece of a drawn path
 
@@ -60,6 +62,14 @@ class Shot:
     goal: np.ndarray | None
     path: Sequence[Piece]
     look_at: np.ndarray
+
+
+def standing(at: Sequence[float]) -> np.ndarray:
+    """The pose [15] of an ant that stands at a point [2] of the floor, its shins 60 degrees down."""
+    bend = np.radians(60.0)
+    height = _SHIN_LENGTH * np.sin(bend) + _LIMB_RADIUS
+    joints = [angle for sign in ANKLE_SIGN for angle in (0.0, sign * bend)]
+    return np.array([*at, height, 1.0, 0.0, 0.0, 0.0, *joints], np.float32)
 
 
 class Painter(Protocol):
@@ -237,9 +247,21 @@ def _gl_camera(view: View, at: np.ndarray) -> mujoco.MjvCamera:
     room = 0.0 if above else 0.13 * half_y  # below, for the caption
     camera.lookat[:] = (x, y - room, 0.0)
     tall = half_y if above else 0.9 * half_y + 0.6 + room
-    half_view = np.tan(np.radians(45.0) / 2)  # MuJoCo's vertical field of view is 45 degrees
+    half_view = np.tan(np.radians(_FIELD_OF_VIEW) / 2)
     camera.distance = max(tall, half_x * view.height / view.width) / half_view
     return camera
+
+
+def project(view: View, points: Any) -> np.ndarray:
+    """Where points [P, 3] (m) are in a picture of the whole arena by OpenGL, [P, 2] px from its upper left corner."""
+    camera = _gl_camera(view, np.zeros(2))
+    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
+    ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    seen = np.asarray(points, np.float64) - (camera.lookat - camera.distance * ahead)
+    sideways, upwards = seen @ right, seen @ np.cross(right, ahead)
+    scale = view.height / 2 / np.tan(np.radians(_FIELD_OF_VIEW) / 2) / (seen @ ahead)
+    return np.stack([view.width / 2 + scale * sideways, view.height / 2 - scale * upwards], axis=-1)
 
 
 def _add_path(scene: mujoco.MjvScene, path: Sequence[Piece]) -> None:
@@ -360,10 +382,9 @@ class FilmPainter:
     """
 
     def __init__(self, footage: Footage, width: int, height: int, camera: CameraName, platform: str | None):
-        x, y, half_x, half_y = extent(footage, margin=_MARGIN)
         pieces = -(-footage.num_steps // _PIECE_STEPS)
         self._footage, self._way = footage, smooth_way(footage)
-        view = View(width, height, camera, (x, y, half_x, half_y), pieces)
+        view = View(width, height, camera, footage.extent(_MARGIN), pieces)
         self._painter = painter(footage.task, view, platform)
 
     def paint(self, step: int) -> np.ndarray:

@@ -304,16 +304,24 @@ def test_vectors_render_every_row():
         ("AntWalker-v0", {"direction": "north"}, "unknown direction 'north'; known: right, up, left, down"),
         ("AntWalker-v0", {"robot": "cat"}, "unknown robot 'cat'"),
         ("AntWalker-v0", {"reward_weights": {"alve": 1.0}}, "unknown reward_weights 'alve'; known: progress"),
-        ("AntWalker-v0", {"reward_weights": {"alive": np.nan}}, "'alive'\\] must be a finite number, got nan"),
-        ("AntWalker-v0", {"reward_weights": {"alive": None}}, "must be a finite number, got None"),
+        (
+            "AntWalker-v0",
+            {"reward_weights": {"alive": np.nan}},
+            "'alive'. must be a finite number",
+        ),
+        ("AntWalker-v0", {"reward_weights": {"alive": None}}, "must be a finite number .*, got None"),
         ("AntWalker-v0", {"reward_weights": 3}, "must be weights by name"),
         ("AntWalker-v0", {"robot": ["heavy"]}, "robot must be a word"),
         ("AntWalker-v0", {"episode_steps": 1.5}, "episode_steps must be a whole number >= 1, got 1.5"),
         ("AntWalker-v0", {"episode_steps": True}, "episode_steps must be a whole number"),
-        ("AntMaze-v0", {"goal_reward": np.nan}, "goal_reward must be a finite number, got nan"),
-        ("AntMaze-v0", {"goal_radius": np.inf}, "goal_radius must be a finite number > 0, or None, got inf"),
+        ("AntMaze-v0", {"goal_reward": np.nan}, "goal_reward must be a finite number .*, got nan"),
+        (
+            "AntMaze-v0",
+            {"goal_radius": np.inf},
+            "goal_radius must be a finite number > 0 .*, or None, got inf",
+        ),
         ("AntMaze-v0", {"xy_scale": 0}, "xy_scale must be a finite number > 0"),
-        ("AntMaze-v0", {"cell": "wide"}, "cell must be a finite number > 0, or None, got 'wide'"),
+        ("AntMaze-v0", {"cell": "wide"}, "cell must be a finite number > 0 .*, or None, got 'wide'"),
         ("AntMaze-v0", {"start_noise": -1.0}, "start_noise must be a finite number >= 0"),
         ("AntMaze-v0", {"penalties": "no"}, "penalties must be True or False, got 'no'"),
         ("AntMaze-v0", {"maze_map": "nowhere"}, "no maze 'nowhere': neither a file nor one of u, spiral"),
@@ -352,6 +360,12 @@ def test_unknown_ids_and_fields_are_named():
         make_vec("AntMaze-v0", 0)
     with pytest.raises(ValueError, match="num_envs must be a whole number"):
         make_vec("AntMaze-v0", True)
+    with pytest.raises(ValueError, match="num_threads must be a whole number >= 0"):
+        make_vec("AntMaze-v0", 1, num_threads=1.5)
+    with pytest.raises(ValueError, match=r"seed must be a number or 1 of them, got 1\.5"):
+        make_vec("AntMaze-v0", 1).reset(seed=1.5)
+    with pytest.raises(ValueError, match="xy_scale must be a finite number"):
+        make_vec("AntMaze-v0", 1, xy_scale=1e300)
     with pytest.raises(ValueError, match="max_episode_steps must be a whole number"):
         make_vec("AntMaze-v0", 1, max_episode_steps=2.5)
 

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -111,7 +112,8 @@ def test_a_goal_is_moved_where_an_ant_can_be(visit, heard):
     assert visit.frame()["ants"][0]["distance"] == pytest.approx(np.hypot(x - 4.0, y + 4.0), abs=0.01)
     for wish, answer in (
         ('{"do": "goal", "at": [0.0, 0.0]}', "0.4 m from every wall"),
-        ('{"do": "goal", "at": [1e9, 0.0]}', "needs|samples|no way"),
+        ('{"do": "goal", "at": [1e9, 0.0]}', "at most 200 m away"),
+        ('{"do": "goal", "at": [50.0, 0.0]}', "no way leads to this goal"),
         ('{"do": "goal", "at": [1.0]}', "a goal is a point"),
         ('{"do": "goal", "at": "x"}', "could not convert"),
         ('{"do": "goal", "at": [NaN, 0.0]}', "a goal is a point"),
@@ -179,8 +181,12 @@ def test_falls_flips_and_arrivals_are_counted_once(visit):
         ('{"do": "goal_quietly", "goal": [0, 0]}', "something unknown"),
         ('{"do": "__class__"}', "something unknown"),
         ('{"do": 3}', "something unknown"),
-        ('{"what": 1}', "do"),
-        ("[]", ""),
+        ('{"what": 1}', "something unknown"),
+        ("[]", "something unknown"),
+        ("null", "something unknown"),
+        ('{"do": "push"}', "push cannot be done with {}"),
+        ('{"do": "pace", "pace": null}', 'pace cannot be done with {"pace": null}'),
+        ('{"do": "arena", "name": []}', 'arena cannot be done with {"name": []}'),
         ("nonsense", "Expecting value"),
         ('{"do": "steer", "direction": 1e999}', "direction must be 0..3"),
         ('{"do": "push", "angle": 1' + 400 * "0" + "}", "too large"),
@@ -225,13 +231,13 @@ def test_a_page_that_comes_back_is_told_everything(visit, heard, monkeypatch):
             return {"step": 1, "running": False, "ways": [[1, 2, 3, 4, 0]]}
 
     monkeypatch.setattr(visit, "lesson", Learning())
-    monkeypatch.setattr(visit, "lesson_arena", visit.arena)
+    monkeypatch.setattr(visit, "lesson_place", (visit.arena, visit.rows[0]))
     told = []
     monkeypatch.setattr(visit, "tell", visit.tell)
     visit.welcome_back(told.append)
     assert [message["is"] for message in told] == ["scene", "lesson"]
     assert (told[1]["fresh"], told[1]["curve"], len(told[1]["ways"])) == (True, [(0.5, 0.25)], 1)
-    monkeypatch.setattr(visit, "lesson_arena", None)
+    monkeypatch.setattr(visit, "lesson_place", (None, visit.rows[0]))
     visit.report_lesson()
     assert told[-1]["ways"] == []  # they were walked in another place
 
@@ -317,6 +323,7 @@ class Company:
     """A Visit without ants."""
 
     left: list[str]
+    lesson = None
 
     def __init__(self, house, tell):
         self.tell, self.count = tell, 0
@@ -430,13 +437,42 @@ def test_a_page_that_comes_back_finds_its_visit(served):
     assert Company.left == []
 
 
-def test_a_visit_that_breaks_is_one_visits_end(served, caplog):
+def test_a_seat_belongs_to_one(monkeypatch):
+    monkeypatch.setattr(visit_module, "KEPT_SECONDS", 0.0)
+    house, first, second, third = House(NOWHERE, ROW, seats=1), object(), object(), object()
+    seat, _ = house.sit("first", first)
+    house.leave_seat(seat, second)  # a page that has lost it changes nothing
+    assert seat.connection is first
+    assert house.sit("second", second) == (None, 0)
+    assert house.sit("third", third) == (None, 1)
+    house.leave_seat(seat, first)
+    assert time.monotonic() - seat.left_at < 60
+    taken, _ = house.sit("second", second)
+    assert house.taken == [taken]
+    assert house.sit("first", object()) == (None, 1)  # who was away too long is a visitor like any other
+    assert not play._sit(house, seat, first, play._Line(None))  # and a page that waited for that seat begins anew
+    assert not seat.here.locked()
+
+
+def test_what_is_told_when_the_page_is_gone_goes_nowhere():
+    class Closed:
+        def send(self, text):
+            raise ConnectionClosed(None, None)
+
+    line = play._Line(Closed())
+    line({"is": "scene"})
+    assert line.gone
+    line.word("nobody hears this")
+
+
+def test_a_visit_that_breaks_is_one_visits_end(served, capsys):
     _, port = served
     with connect(f"ws://127.0.0.1:{port}/ants") as visitor:
         visitor.send("break")
         assert hear(visitor, "word")["text"] == "the visit ended: broken"
     with connect(f"ws://127.0.0.1:{port}/ants") as visitor:
         assert hear(visitor, "frame")
+    assert "RuntimeError: broken" in capsys.readouterr().err
 
 
 def test_a_taken_port_is_said(served, capsys):
@@ -482,7 +518,8 @@ def test_ctrl_c_closes_cleanly(learns):
             with pytest.raises(ConnectionClosed):
                 hear(visitor, "nothing more")
     out, err = process.communicate(timeout=120)
-    assert (process.returncode, out, err) == (0, "closing\n", "")
+    lesson = "a lesson finishes what it is at, or compiling; Ctrl-C again does not wait\n" if learns else ""
+    assert (process.returncode, out, err) == (0, f"closing\n{lesson}", "")
 
 
 def test_a_signal_before_the_server_serves_closes_it_too(monkeypatch):

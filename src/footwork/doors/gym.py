@@ -73,7 +73,7 @@ class _Offered:
             "render_modes": [mode for mode in _RENDER_MODES if mode != "human" or _has_screen()],
             "render_fps": max(1, round(1 / (self.setting.option_steps * self.setting.task.robot.control_dt))),
         }
-        self._num_rows, self._num_threads = num_envs, num_threads
+        self._num_rows, self._num_threads = num_envs, _count("num_threads", num_threads, lowest=0)
         self._made: Rows | None = None
         self._shower: Shower | None = None
 
@@ -325,10 +325,10 @@ class AntVectorEnv(_Offered, VectorEnv[Any, Any, Any]):
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
+        if isinstance(seed, Integral) and not isinstance(seed, bool):
             return [int(seed) + row for row in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed must be a number or {self.num_envs} of them, got {len(seed)}")
+        if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or len(seed) != self.num_envs:
+            raise ValueError(f"seed must be a number or {self.num_envs} of them, got {seed!r}")
         return list(seed)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -410,14 +410,14 @@ def make_vector(name: str, num_envs: int, **fields: Any) -> AntVectorEnv:
 # Numbers in and out -------------------------------------------------------------------------------------------------
 
 
-def _count(name: str, value: Any) -> int:
-    """A whole number >= 1, numpy's too.
+def _count(name: str, value: Any, lowest: int = 1) -> int:
+    """A whole number, numpy's too.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is none, or less than the lowest.
     """
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-        raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < lowest:
+        raise ValueError(f"{name} must be a whole number >= {lowest}, got {value!r}")
     return int(value)
 
 

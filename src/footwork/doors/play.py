@@ -8,15 +8,16 @@ visit as it was, its lesson too, unless somebody who waited has taken the seat.
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
+import logging
 import os
 import signal
 import socket
+import sys
 import threading
 import time
-from collections.abc import Callable
+import traceback
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -44,28 +45,60 @@ ELSEWHERE = 4001  # the code with which a page is closed whose visit another pag
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
+class _Line:
+    """What goes to a page; once the page is gone, nowhere. So nothing that a visit does fails because nobody looks."""
+
+    def __init__(self, connection: ServerConnection):
+        self._connection = connection
+        self.gone = False
+
+    def __call__(self, message: dict[str, Any]) -> None:
+        if self.gone:
+            return
+        try:
+            self._connection.send(json.dumps(message))
+        except ConnectionClosed:
+            self.gone = True
+
+    def word(self, text: str, bad: bool = False) -> None:
+        """A line on the page that stays."""
+        self({"is": "word", "text": text, "bad": bad, "stays": True})
+
+
 def attend(house: House, connection: ServerConnection) -> None:
     """A visitor's thread, from coming to going."""
-    tell: Callable[[dict[str, Any]], None] = lambda message: connection.send(json.dumps(message))  # noqa: E731
-    seat: Seat | None = None
+    line = _Line(connection)
+    while (seat := _take_seat(house, _token_of(connection), connection, line)) is not None:
+        try:
+            if _sit(house, seat, connection, line):
+                return
+        finally:
+            house.leave_seat(seat, connection)
+
+
+def _sit(house: House, seat: Seat, connection: ServerConnection, line: _Line) -> bool:
+    """The visit, from when the page has it to itself; False if the seat was lost while another page still had it."""
+    while not seat.here.acquire(timeout=_WAIT):
+        line.word("the visit is busy; one moment …")
+        if house.closing.is_set() or line.gone:
+            return True
     try:
-        seat = _take_seat(house, _token_of(connection), connection, tell)
-        if seat is None:
-            return
-        with seat.here:
-            _receive(house, seat, tell)
-            _keep_company(house, seat, connection)
+        if seat not in house.taken:
+            return False
+        _receive(house, seat, line)
+        _keep_company(house, seat, connection, line)
     except ConnectionClosed:
-        pass  # they went away; the server stays
+        pass  # they went away; the visit waits for them
     except Exception as error:
-        if seat is not None:
-            house.dismiss(seat)
-        with contextlib.suppress(ConnectionClosed):
-            tell({"is": "word", "text": f"the visit ended: {error}", "bad": True, "stays": True})
-        raise
+        house.dismiss(seat)
+        line.word(f"the visit ended: {error}", bad=True)
+        if isinstance(error, ValueError | OSError):
+            print(f"footwork: a visit ended: {error}", file=sys.stderr)
+        else:
+            traceback.print_exc()
     finally:
-        if seat is not None and seat.connection is connection:
-            seat.connection, seat.left_at = None, time.monotonic()
+        seat.here.release()
+    return True
 
 
 def _token_of(connection: ServerConnection) -> str:
@@ -74,19 +107,17 @@ def _token_of(connection: ServerConnection) -> str:
     return query.get("visit", [""])[0][:_TOKEN_LENGTH] or str(connection.id)
 
 
-def _take_seat(
-    house: House, token: str, connection: ServerConnection, tell: Callable[[dict[str, Any]], None]
-) -> Seat | None:
-    """The seat of this token, or a free one, when it is this visitor's turn; None when the house closes."""
+def _take_seat(house: House, token: str, connection: ServerConnection, line: _Line) -> Seat | None:
+    """The seat of this token, or a free one, when it is this visitor's turn; None when the house closes, or they go."""
     told_at, told = -_TELL_AGAIN, ""
     try:
-        while not house.closing.is_set():
+        while not house.closing.is_set() and not line.gone:
             seat, before = house.sit(token, connection)
             if seat is not None:
                 return seat
             text = _please_wait(house.seats, before)
             if text != told or time.monotonic() - told_at >= _TELL_AGAIN:  # which also notices who has left
-                tell({"is": "word", "text": text, "bad": False, "stays": True})
+                line.word(text)
                 told_at, told = time.monotonic(), text
             time.sleep(_WAIT)
     finally:
@@ -99,19 +130,19 @@ def _please_wait(seats: int, before: int) -> str:
     return f"{here}; {f'{before} more before you' if before else 'you are next'}"
 
 
-def _receive(house: House, seat: Seat, tell: Callable[[dict[str, Any]], None]) -> None:
+def _receive(house: House, seat: Seat, line: _Line) -> None:
     """Begin a visit, or go on with the one that this page had before it was loaded again or cut off."""
     if seat.visit is None:
-        seat.visit = Visit(house, tell)
+        seat.visit = Visit(house, line)
     else:
-        seat.visit.welcome_back(tell)
+        seat.visit.welcome_back(line)
 
 
-def _keep_company(house: House, seat: Seat, connection: ServerConnection) -> None:
+def _keep_company(house: House, seat: Seat, connection: ServerConnection, line: _Line) -> None:
     visit = seat.visit
     assert visit is not None
     last = due = time.monotonic()
-    while not house.closing.is_set() and seat.connection is connection:
+    while not house.closing.is_set() and not line.gone and seat.connection is connection:
         _hear_all(visit, connection)
         now = time.monotonic()
         visit.step(now - last)
@@ -120,8 +151,8 @@ def _keep_company(house: House, seat: Seat, connection: ServerConnection) -> Non
         visit.report_lesson()
         due = max(due, now - 1 / FRAMES_PER_SECOND) + 1 / FRAMES_PER_SECOND  # a late picture is made up for by the next
         time.sleep(max(0.0, due - time.monotonic()))
-    if not house.closing.is_set():
-        visit.say("this visit goes on in another window", stays=True)
+    if seat.connection is not connection:
+        line.word("this visit goes on in another window")
         connection.close(ELSEWHERE)
 
 
@@ -197,6 +228,7 @@ def open_server(house: House, host: str = "127.0.0.1", port: int = 8765) -> Serv
             process_request=lambda connection, request: _answer(text, hosts, request),
             max_size=64 * 1024,
             compression=None,
+            logger=_quiet(),
             family=socket.AF_INET6 if ":" in host else socket.AF_INET,
         )
     except OSError as error:
@@ -205,6 +237,13 @@ def open_server(house: House, host: str = "127.0.0.1", port: int = 8765) -> Serv
         raise ValueError(f"cannot listen on {host}, port {port}: {error.strerror or error}") from None
     except OverflowError:
         raise ValueError(f"port must be in 0..65535, got {port}") from None
+
+
+def _quiet() -> logging.Logger:
+    """Websockets' own words, of pages that went away without one, are nobody's business: ours are said by ourselves."""
+    logger = logging.getLogger("footwork.play.websockets")
+    logger.setLevel(logging.CRITICAL)
+    return logger
 
 
 def address_of(server: Server) -> str:
@@ -241,6 +280,8 @@ def play(row: str, runs: Path, host: str, port: int, seats: int, lesson_steps: i
         print(f"{address_of(server)}   (Ctrl-C ends it)", flush=True)
         server.serve_forever()
         print("closing", flush=True)
+        if house.stop_lessons():
+            print("a lesson finishes what it is at, or compiling; Ctrl-C again does not wait", flush=True)
         closing.join()  # visitors' threads need the interpreter whole
         house.empty()
     finally:

@@ -287,11 +287,12 @@ _KINDS: dict[str, tuple[str, bool]] = {
     "reward": ("word", False),
     "fall_rule": ("word", False),
 }
+_MOST = 1e9  # what is larger does not go together with single precision
 _WANTED = {
     "count": "a whole number >= 1",
-    "length": "a finite number > 0",
-    "distance": "a finite number >= 0",
-    "number": "a finite number",
+    "length": "a finite number > 0 (and <= 1e9)",
+    "distance": "a finite number >= 0 (and <= 1e9)",
+    "number": "a finite number (within +-1e9)",
     "switch": "True or False",
     "word": "a word",
 }
@@ -313,10 +314,11 @@ def _checked(name: str, value: Any) -> Any:
     return read
 
 
-def _read_number(value: Any, lowest: float = -math.inf, open_below: bool = False) -> float | None:
+def _read_number(value: Any, lowest: float = -_MOST, open_below: bool = False) -> float | None:
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not math.isfinite(value):
         return None
-    return None if value < lowest or (open_below and value == lowest) else float(value)
+    number = float(value)
+    return None if not lowest <= number <= _MOST or (open_below and number == lowest) else number
 
 
 def _read_count(value: Any) -> int | None:
@@ -380,7 +382,7 @@ def _weighed(task: Task, reward_weights: Mapping[str, float] | None) -> Task:
     for name, value in reward_weights.items():
         weight = _read_number(value)
         if weight is None:
-            raise ValueError(f"reward_weights[{name!r}] must be a finite number, got {value!r}")
+            raise ValueError(f"reward_weights[{name!r}] must be {_WANTED['number']}, got {value!r}")
         changed[name] = weight
     return replace(task, weights=replace(task.weights, **changed))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import threading
 import time
@@ -25,6 +26,7 @@ LESSON_STEPS = 1_000_000  # control steps
 FRAMES_PER_SECOND = 1 / 0.033  # two control steps each
 KEPT_SECONDS = 10.0  # that a visitor may be away before somebody who waits gets the seat
 _LESSON_PERIOD = 0.5  # s between reports of a lesson
+_FARTHEST = 200.0  # m, of a goal
 _PACES = (0.25, 4.0)
 
 
@@ -76,6 +78,8 @@ class House:
             seat = next((seat for seat in self.taken if seat.token == token), None)
             if seat is not None:
                 seat.connection = connection  # a page that still shows it lets go
+                if connection in self.waiting:
+                    self.waiting.remove(connection)
                 return seat, 0
             if connection not in self.waiting:
                 self.waiting.append(connection)
@@ -84,9 +88,12 @@ class House:
             if before > 0 or (len(self.taken) >= self.seats and abandoned is None):
                 return None, before
             seat = Seat(token, connection)
+            if abandoned is not None:
+                self.taken.remove(abandoned)  # from now on its owner is a visitor like any other
             self.taken.append(seat)
-        if abandoned is not None:
-            self.dismiss(abandoned)
+            self.waiting.remove(connection)
+        if abandoned is not None and abandoned.visit is not None:
+            abandoned.visit.leave()
         return seat, 0
 
     def _abandoned(self) -> Seat | None:
@@ -94,6 +101,12 @@ class House:
         away = [seat for seat in self.taken if seat.connection is None]
         seat = min(away, key=lambda seat: seat.left_at, default=None)
         return None if seat is None or time.monotonic() - seat.left_at < KEPT_SECONDS else seat
+
+    def leave_seat(self, seat: Seat, connection: object) -> None:
+        """Go away from a seat, unless another page has it by now; it is kept for a while."""
+        with self.lock:
+            if seat.connection is connection:
+                seat.connection, seat.left_at = None, time.monotonic()
 
     def stand_up(self, connection: object) -> None:
         """Wait no more."""
@@ -109,8 +122,17 @@ class House:
         if seat.visit is not None:
             seat.visit.leave()
 
+    def stop_lessons(self) -> int:
+        """Ask all lessons to end; how many were going on."""
+        visits = [seat.visit for seat in list(self.taken) if seat.visit is not None]
+        going_on = [visit for visit in visits if visit.lesson is not None and visit.lesson.running]
+        for visit in going_on:
+            visit.do_stop()
+        return len(going_on)
+
     def empty(self) -> None:
         """End all visits, those whose pages are gone too."""
+        self.stop_lessons()
         for seat in list(self.taken):
             self.dismiss(seat)
 
@@ -137,7 +159,7 @@ class Visit:
         self.who, self.held = "trained", 0
         self.pace, self.paused = 1.0, False
         self.lesson: Lesson | None = None
-        self.lesson_arena: Arena | None = None
+        self.lesson_place: tuple[Arena, str] | None = None  # where it learns, and on which sub-policies
         self.lesson_leads = False  # once it can
         self.ants: list[Ant] = []
         self.masters: list[Master | None] = []
@@ -145,7 +167,11 @@ class Visit:
         self._recent: list[tuple[float, int]] = []
         self._reported = 0.0
         self._behind = 0.0
-        self.build(self.arena.goals[0])
+        try:
+            self.build(self.arena.goals[0])
+        except Exception:
+            self.leave()
+            raise
 
     # What the visitor may do: one method per message ``{"do": name, ...}`` ------------------------------------
 
@@ -169,7 +195,12 @@ class Visit:
         if inside_walls(self.arena, goal, CLEARANCE):
             raise ValueError("a goal must keep 0.4 m from every wall")
         place = (float(goal[0]), float(goal[1]))
-        planner = Planner.to(self.arena, place)  # refuses what cannot be reached
+        if np.abs(goal).max() > _FARTHEST:
+            raise ValueError(f"a goal is at most {_FARTHEST:.0f} m away")
+        try:
+            planner = Planner.to(self.arena, place)
+        except ValueError:
+            raise ValueError("no way leads to this goal") from None
         self._planner = (place, planner)
         for ant in self.ants:
             ant.move_goal(goal)
@@ -202,7 +233,9 @@ class Visit:
 
     def do_sub_policies(self, rows: Any) -> None:
         """One or two kinds of sub-policies, side by side."""
-        known = [*known_walkers(self.house.runs, self.first.engine), self._given[1].experiment.name]
+        known = list(
+            dict.fromkeys((*known_walkers(self.house.runs, self.first.engine), self._given[1].experiment.name))
+        )
         if not isinstance(rows, list) or not 1 <= len(rows) <= 2 or any(row not in known for row in rows):
             raise ValueError(f"choose one or two of {', '.join(known)}; got {rows!r}")
         self.move_to(rows=list(rows))
@@ -235,7 +268,8 @@ class Visit:
         arena = replace(self.arena, goals=(self.goal(),))
         row = self.master_row()
         experiment = replace(row, task=replace(row.task, arena=arena), total_steps=self.house.lesson_steps)
-        self.lesson, self.lesson_arena = Lesson(experiment, self.find_sub_policies(self.rows[0])), self.arena
+        self.lesson = Lesson(experiment, self.find_sub_policies(self.rows[0]))
+        self.lesson_place = (self.arena, self.rows[0])
         self.lesson_leads, self._reported = True, 0.0
         self._report_lesson(fresh=True)
 
@@ -277,7 +311,8 @@ class Visit:
         found = ["you", "planner"]
         if any(self.masters):
             found.append("trained")
-        if self.lesson is not None and self.lesson_arena == self.arena and self.lesson.params is not None:
+        here = self.lesson_place == (self.arena, self.rows[0])
+        if self.lesson is not None and here and self.lesson.params is not None:
             found.append("lesson")
         return found
 
@@ -396,7 +431,7 @@ class Visit:
         """Tell of the lesson, from its beginning if the page knows nothing of it; tells whether it goes on."""
         assert self.lesson is not None
         report = self.lesson.report()
-        if self.lesson_arena != self.arena:
+        if self.lesson_place is None or self.lesson_place[0] != self.arena:
             report["ways"] = []  # they were walked in another place
         curve = {"curve": self.lesson.curve()} if fresh else {}
         self.tell({"is": "lesson", "fresh": fresh, **curve, **report})
@@ -430,16 +465,23 @@ class Visit:
         }
 
     def hear(self, text: str | bytes) -> None:
-        """Do what a message asks for; what cannot be done is said."""
+        """Do what a message asks for; what cannot be done is said, and changes nothing."""
         try:
-            message = json.loads(text)
-            name = message.pop("do")
-            action = getattr(self, f"do_{name}", None) if isinstance(name, str) else None
-            if action is None or name not in ACTIONS:
-                raise ValueError(f"the page asked for something unknown: {name!r}")
+            self._do(text)
+        except (ValueError, OSError, OverflowError, RecursionError, RuntimeError, MemoryError) as error:
+            self.say(str(error) or type(error).__name__, bad=True)
+
+    def _do(self, text: str | bytes) -> None:
+        message = json.loads(text)
+        name = message.pop("do", None) if isinstance(message, dict) else None
+        if not isinstance(name, str) or name not in ACTIONS:
+            raise ValueError(f"the page asked for something unknown: {name!r}")
+        action = getattr(self, f"do_{name}")
+        try:
+            inspect.signature(action).bind(**message)
             action(**message)
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, OSError) as error:
-            self.say(str(error), bad=True)
+        except TypeError:  # of another kind than the action takes, or not the details that it takes
+            raise ValueError(f"{name} cannot be done with {json.dumps(message)}") from None
 
     def leave(self) -> None:
         """End what goes on in the background."""

@@ -34,9 +34,7 @@ def parity_figure(found: dict[str, Any]) -> bytes:
         )
         height.set_title("height of the torso while alive (m)")
         transfer = found.get("transfer", {})
-        _grouped(
-            handover, {row.rpartition("/")[2]: {a: f["success"] for a, f in on.items()} for row, on in transfer.items()}
-        )
+        _grouped(handover, {_shown(row): {a: f["success"] for a, f in on.items()} for row, on in transfer.items()})
         handover.set_title("hand-overs at right angles that succeed")
         _rates(speed, found.get("speed", {}))
         handles = [Patch(color=colour) for colour in _COLOURS.values()]
@@ -59,6 +57,12 @@ def curves_figure(curves: dict[str, list[dict[str, Any]]]) -> bytes:
         return _png(figure)
 
 
+def _shown(row: str) -> str:
+    """A walker row's address in short; runs of an engine begin with its name."""
+    engine, _, name = row.rpartition("walker/")
+    return f"{engine.strip('/')}: {name}" if engine else name
+
+
 def _kinds(statistics: dict[str, Any]) -> list[str]:
     return list(dict.fromkeys(kind for by_kind in statistics.values() for kind in by_kind))
 
@@ -72,7 +76,12 @@ def _grouped(ax: Any, groups: dict[str, dict[str, float]]) -> None:
     for number, (name, colour) in enumerate(_COLOURS.items()):
         at = [(x, values[name]) for x, values in enumerate(groups.values()) if name in values]
         ax.bar([x + (number - 2.5) * width for x, _ in at], [value for _, value in at], width, color=colour)
-    ax.set_xticks(range(len(groups)), [name.replace(", ", ",\n") for name in groups], fontsize=7)
+    ax.set_xticks(range(len(groups)), [_broken(name) for name in groups], fontsize=7 if len(groups) < 4 else 5.5)
+
+
+def _broken(name: str) -> str:
+    """A name in lines that fit under a group of bars."""
+    return name.replace(", ", ",\n").replace(": ", ":\n").replace("-", "-\n")
 
 
 def _rates(ax: Any, speeds: dict[str, Any]) -> None:

@@ -335,6 +335,14 @@ def test_figures_are_drawn_from_files_alone(study, tmp_path):
     assert [path.read_bytes() for path in again.files] == [path.read_bytes() for path in drawn[1].files]
 
 
+@pytest.mark.parametrize("prefix", ["light/", "bullet/"])
+def test_every_figure_can_be_drawn_of_another_ant_or_engine(study, tmp_path, prefix):
+    fill(study, [prefix + row for row in ("walker/plain", "walker/interleaved", "maze/hrl/plain")], 2)
+    drawn = draw_figures(results.Results(study), FIGURES, tmp_path, prefix)
+    assert {"11-handovers", "12-switching", "19-choices"} <= {one.figure.name for one in drawn}
+    assert all(path.is_file() and path.parent.name == prefix.strip("/") for one in drawn for path in one.files)
+
+
 def test_every_figure_is_drawn_where_there_is_nothing_yet(study, tmp_path):
     study.runs.mkdir()
     numbers = [int(figure.name.partition("-")[0]) for figure in FIGURES]

@@ -8,7 +8,7 @@ import numpy as np
 
 from footwork.arena import DIRECTIONS
 from footwork.statistics import Effect, contrast, generator_for, performance_profile
-from footwork.study.experiments import GRIDS, Grid, is_row
+from footwork.study.experiments import GRIDS, Grid
 from footwork.study.figures.style import Look, empty, interval_marks, label_of, legend_below, look_of, panels
 from footwork.study.measure import TRANSITIONS
 from footwork.study.results import METRICS, Results
@@ -133,7 +133,7 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
     fields = [g for g in GRIDS if g.field in ("ppo.minibatch_size", "task.potential") and "walker" not in g.base]
     masters = [row for grid in fields for row in grid.points().values()]
     walkers = [row for grid in GRIDS if grid.base == "walker/plain" for row in grid.points().values()]
-    ants = [f"{ant}{row}" for row in rows for ant in ("", "light/") if is_row(f"{ant}{row}")]
+    ants = [f"{ant}{row}" for row in rows for ant in ("", "light/")]
     _dots(axes[0, 0], results, "way", masters)
     _dots(axes[1, 0], results, "handover", [*walkers, *(row for row in ants if "walker/" in row)])
     _dots(axes[2, 0], results, "way", [row for row in ants if "walker/" not in row])

@@ -28,6 +28,7 @@ class Figure:
         draw: from the results and the rows, a matplotlib figure.
         rows: that it reads.
         paper: the figure of the paper that it answers, if any.
+        compares_ants: it sets ants beside each other, so that there is one of it and not one for each.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Figure:
     draw: Callable[[Results, tuple[str, ...]], Any]
     rows: tuple[str, ...] = ()
     paper: str = ""
+    compares_ants: bool = False
 
 
 class Drawn(NamedTuple):
@@ -220,6 +222,7 @@ FIGURES: tuple[Figure, ...] = (
         "IQM over seeds with 95 % intervals.",
         measures.comparisons,
         ("walker/plain", "walker/interleaved", "maze/hrl/plain", "maze/hrl/interleaved"),
+        compares_ants=True,
     ),
 )
 
@@ -245,7 +248,8 @@ def draw_figures(results: Results, figures: Iterable[Figure], to: Path, prefix: 
     """Draw figures into a folder, each as PNG and as SVG.
 
     With a prefix such as ``light/``, the same of the rows under it, into a folder of that name: results of
-    different engines and ants stay apart. Figures of which there is nothing under it are left out.
+    different engines and ants stay apart. Figures of which there is nothing under it are left out, and
+    those that compare ants themselves.
     """
     note = "" if results.study.size.name == "full" else f"{results.study.size.name} study: short runs, few seeds"
     note = "runs of any length" if results.any_length else note
@@ -254,7 +258,7 @@ def draw_figures(results: Results, figures: Iterable[Figure], to: Path, prefix: 
     for figure in figures:
         rows = tuple(prefix + row for row in figure.rows if is_row(prefix + row))
         without = tuple(row for row in rows if not results.samples(row))
-        if prefix and len(without) == len(rows):
+        if prefix and (figure.compares_ants or len(without) == len(rows)):
             continue
         with styled():
             files = save(figure.draw(results, rows), to / prefix / figure.name, note)

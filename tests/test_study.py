@@ -14,8 +14,8 @@ from footwork.arena import MAZES
 from footwork.doors.cli import run
 from footwork.evaluate import Episodes
 from footwork.record import RunDir, RunError, read_metrics
-from footwork.statistics import Effect
-from footwork.study import claims, measure, plan, report, results
+from footwork.statistics import Effect, iqm
+from footwork.study import answers, claims, measure, plan, report, results
 from footwork.study.experiments import EXPERIMENTS, GRIDS, MAIN, find_row, match_rows
 from footwork.study.figures import FIGURES, draw_figures, find_figures
 from footwork.study.plan import FULL, QUICK, Study
@@ -385,8 +385,29 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
 
 
 def test_answers_name_claims_and_figures_that_exist():
-    assert {n for answer in report.ANSWERS for n in answer.claims} == {claim.number for claim in claims.CLAIMS}
-    assert {n for answer in report.ANSWERS for n in answer.figures} == set(range(1, len(FIGURES) + 1))
+    assert {n for answer in answers.ANSWERS for n in answer.claims} == {claim.number for claim in claims.CLAIMS}
+    assert {n for answer in answers.ANSWERS for n in answer.figures} == set(range(1, len(FIGURES) + 1))
+    rows = {row for answer in answers.ANSWERS for shown in answer.shows for _, row in shown.rows}
+    assert {row.removeprefix("bullet/") for row in rows} <= set(EXPERIMENTS)
+
+
+def test_an_answer_shows_its_rows_and_names_those_that_have_no_runs(study):
+    fill(study, ("walker/plain",), 3)
+    found = results.Results(study)
+    sentence = next(answer for answer in answers.ANSWERS if answer.section == "3.4")
+    speed, handover = answers.said(sentence, claims.judge_all(found), found).splitlines()[1:]
+    mean = results.METRICS["speed"].show(float(iqm(found.scores("walker/plain", "speed"))))
+    assert f"walker/plain: {mean} (3 seeds); no runs of light/walker/plain, bullet/walker/plain" in speed
+    assert handover.startswith(results.METRICS["handover"].words)
+
+
+def test_one_seed_has_no_interval(study):
+    fill(study, ("walker/plain", "walker/random-start"), 1)
+    (judgement,) = (j for j in claims.judge_all(results.Results(study)) if j.claim.number == 12)
+    assert re.fullmatch(r"[\d.]+ %", claims.show_effect(judgement.findings[0]))
+    assert judgement.why.startswith("1 seed, 10 are asked for")
+    (variance,) = (j for j in claims.judge_all(results.Results(study)) if j.claim.number == 6)
+    assert claims.show_effect(variance.findings[0]) == "-"
 
 
 @pytest.mark.parametrize(

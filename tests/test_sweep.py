@@ -185,7 +185,7 @@ def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
     """What a job trains on, of a run with several seeds too; and that it measures what it trained."""
     from footwork import checkpoint
     from footwork.record import RunDir, config_to_json
-    from footwork.study.runs import NEEDED
+    from footwork.study.runs import NEEDED, find_needed, find_trained
     from footwork.train import policy_meta
     from test_train import tiny, untrained
 
@@ -217,6 +217,16 @@ def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
     job.complete(Study(tmp_path / "copy", size), "bandit/hrl/symmetric", 1)
     again = checkpoint.load_arrays(run_path(tmp_path / "copy", "bandit/hrl/symmetric", (1,)) / "policy.safetensors")[0]
     assert all((again[name] == array).all() for name, array in checkpoint.load_arrays(master.policy_path)[0].items())
+    # of a row's first seed the report keeps a master too, with what it stands on
+    assert len(results.samples("bandit/hrl/symmetric")) == 1
+    export(results, tmp_path / "whole")
+    kept = run_path(tmp_path / "whole", "bandit/hrl/symmetric", (1,))
+    small = find_trained(str(kept), tmp_path)
+    assert small.params.keys() == {"actor"}
+    assert (
+        small.params["actor"]["output"]["bias"] == checkpoint.load_arrays(master.policy_path)[0]["actor/output/bias"]
+    ).all()
+    assert find_needed(small, tmp_path).source == str(kept / NEEDED)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="ray is installed")

@@ -443,18 +443,20 @@ def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
         return f"no runs of {', '.join(dict.fromkeys(missing))}"
     fewest = min(min(f.seeds) for f in deciding)
     if fewest < claim.min_seeds:
-        return f"{fewest} seeds, {claim.min_seeds} are asked for; so far: {_overall([f.so_far for f in deciding])}"
+        so_far = _overall([f.so_far for f in deciding])
+        return f"{fewest} seed{'' if fewest == 1 else 's'}, {claim.min_seeds} are asked for; so far: {so_far}"
     return "the interval allows both"
 
 
 def show_effect(finding: Finding) -> str:
-    """The effect with its interval, in the metric's unit."""
+    """The effect with its interval, in the metric's unit; one seed has no interval, and no spread."""
     if finding.effect is None:
         return "-"
-    estimate, low, high = finding.effect
-    if METRICS[finding.contrast.metric].percent:
-        return f"{100 * estimate:.1f} [{100 * low:.1f}, {100 * high:.1f}] %"
-    return f"{estimate:.4g} [{low:.4g}, {high:.4g}]"
+    percent, alone = METRICS[finding.contrast.metric].percent, min(finding.seeds) == 1
+    if alone and finding.contrast.statistic == "spread":
+        return "-"
+    shown = [f"{100 * value:.1f}" if percent else f"{value:.4g}" for value in finding.effect]
+    return shown[0] + ("" if alone else f" [{shown[1]}, {shown[2]}]") + (" %" if percent else "")
 
 
 __all__ = [

@@ -21,50 +21,15 @@ import numpy as np
 import footwork
 from footwork.checkpoint import write_atomically
 from footwork.statistics import iqm
+from footwork.study.answers import ANSWERS, said, seeds_in_words
 from footwork.study.claims import CLAIMS, Finding, Judgement, judge_all, prefixes_at_hand, rows_read, show_effect
 from footwork.study.experiments import EXPERIMENTS, find_row, is_row
 from footwork.study.figures import FIGURES, Drawn, draw_figures
 from footwork.study.measure import EVALUATION, TRANSITIONS
 from footwork.study.plan import STUDY_FILE, read_machine
 from footwork.study.results import CURVE, METRICS, Results, write_curve
-from footwork.study.runs import save_actors
+from footwork.study.runs import NEEDED, save_actors
 from footwork.train import planned_steps
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A sentence of the paper, and where the report answers it."""
-
-    section: str
-    words: str
-    claims: tuple[int, ...] = ()
-    figures: tuple[int, ...] = ()
-
-
-# The paper in its own order; its sentences shortened.
-ANSWERS: tuple[Answer, ...] = (
-    Answer("3.1", "AntWalker: four directions, targets 10 km away (Figure 1)", figures=(1,)),
-    Answer("3.2", "AntBandit: one of the four corners of a square (Figure 2)", figures=(2,)),
-    Answer("3.3", "AntMaze: a fixed point in a maze (Figure 3)", figures=(3,)),
-    Answer("3.4", "The vanilla ant in PyBullet is heavier than MuJoCo's, which makes it harder", figures=(19,)),
-    Answer("4", "Every k steps the master decides which policy runs next (Figure 4)", figures=(4,)),
-    Answer("4", "k is a hyperparameter (not stated)", figures=(13,)),
-    Answer("6", "The agent consistently fails to transition to an orthogonal policy", (12,), (11,)),
-    Answer("6", "Random start, random repeated: t timesteps (not stated)", figures=(14,)),
-    Answer("6", "Appropriate bias seems to work best", (10,), (11, 12)),
-    Answer("6", "Transitions take place successfully almost always", (11,), (11,)),
-    Answer("7", "Create B = 32 batches, of S = 128 and 40 (a number, or a size?)", figures=(19,)),
-    Answer("8", "Stability penalties while training the master do not make a difference", (13,)),
-    Answer("8", "The regularised hierarchy outperforms the flat policies (Figures 5, 6)", (1, 2), (5, 6, 15, 18)),
-    Answer("8", "Flat policies without stability penalties perform better than with them", (3,), (5, 6)),
-    Answer("8", "Unregularised sub-policies show a considerably smaller variance (Figures 7, 8)", (6,), (7, 8)),
-    Answer("8", "Unregularised policies achieve higher rewards eventually", (5,), (7, 8)),
-    Answer("8", "... but do not allow smooth transitions", (12,), (11, 12)),
-    Answer("8", "Regularised sub-policies serve as much better slaves (Figures 9, 10)", (7, 8), (9, 10, 16)),
-    Answer("8", "The difference is much more pronounced on AntMaze", (9,), (9, 10)),
-    Answer("9", "Moving straight to the target, the flat policy gets stuck in a wall", (4,), (16, 17)),
-    Answer("ours", "Interleaved sub-policies; one symmetric policy", (14, 15), (11, 12)),
-)
 
 
 @dataclass(frozen=True)
@@ -141,7 +106,7 @@ def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> lis
         )
     blocks += [Heading("Claims"), _claims_table(judgements), Text(_READING)]
     blocks += [Heading("Every comparison", 3), _comparisons_table(judgements)]
-    blocks += [Heading("The paper, in its order"), _answers_table(judgements)]
+    blocks += [Heading("The paper, in its order"), _answers_table(judgements, results)]
     blocks += [Heading("Figures"), *[Picture(d) for d in drawn]]
     blocks += [Heading("Rows"), _rows_table(results, rows)]
     blocks += [Heading("Left out, and why"), *_left_out(results, drawn)]
@@ -192,7 +157,7 @@ def _claims_table(judgements: Sequence[Judgement]) -> TableBlock:
 def _said(finding: Finding) -> str:
     """A comparison in one line."""
     chance = "" if finding.probability is None else f", P {finding.probability:.2f}"
-    return f"{finding.contrast.words}: {show_effect(finding)}{chance}, {_seeds(finding.seeds)} seeds"
+    return f"{finding.contrast.words}: {show_effect(finding)}{chance}, {seeds_in_words(_seeds(finding.seeds))}"
 
 
 def _source(judgement: Judgement) -> str:
@@ -227,14 +192,12 @@ def _comparisons_table(judgements: Sequence[Judgement]) -> TableBlock:
     return TableBlock(header, tuple(rows))
 
 
-def _answers_table(judgements: Sequence[Judgement]) -> TableBlock:
-    rows = []
-    for answer in ANSWERS:
-        said = [
-            f"claim {j.claim.number}, {j.where}: {j.verdict}" for j in judgements if j.claim.number in answer.claims
-        ]
-        rows.append((answer.section, answer.words, "\n".join(said) or "-", ", ".join(map(str, answer.figures)) or "-"))
-    return TableBlock(("section", "the paper says", "answer", "figures"), tuple(rows))
+def _answers_table(judgements: Sequence[Judgement], results: Results) -> TableBlock:
+    rows = tuple(
+        (answer.section, answer.words, said(answer, judgements, results), ", ".join(map(str, answer.figures)) or "-")
+        for answer in ANSWERS
+    )
+    return TableBlock(("section", "the paper says", "answer", "figures"), rows)
 
 
 def _rows_table(results: Results, rows: Sequence[str]) -> TableBlock:
@@ -288,8 +251,9 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
 def export(results: Results, to: Path) -> None:
     """Copy the small files of every run that was read: enough to draw and to judge again.
 
-    And the sub-policies, without their critics: masters stand on them, so that ``footwork reproduce`` goes on from a
-    copy of this folder as it would from the runs themselves.
+    And policies, without their critics. All sub-policies, since masters stand on them: so ``footwork reproduce`` goes
+    on from a copy of this folder as it would from the runs themselves. Of every other row those of the first seed,
+    with the sub-policies that it was trained on: so each row can be watched and evaluated from here.
 
     Raises:
         OSError: they cannot be written.
@@ -309,8 +273,10 @@ def export(results: Results, to: Path) -> None:
             curve = results.whole_curve(sample)
             if curve is not None:
                 write_curve(place / CURVE, curve, None)
-            if sample.experiment.is_walker and run.policy_path.is_file():
-                save_actors(run, place / run.policy_path.name)
+            if sample.experiment.is_walker or run == samples[0].run:
+                for path in (run.policy_path, run.path / NEEDED):
+                    if path.is_file() and not (path.name == NEEDED and sample.experiment.is_walker):
+                        save_actors(path, place / path.name)
     if (results.study.runs / STUDY_FILE).is_file():
         shutil.copyfile(results.study.runs / STUDY_FILE, to / STUDY_FILE)
 
@@ -415,4 +381,4 @@ def _inline(text: str) -> str:
     return "".join(parts)
 
 
-__all__ = ["ANSWERS", "Answer", "export", "report_blocks", "write_report"]
+__all__ = ["export", "report_blocks", "write_report"]

@@ -198,14 +198,14 @@ def load_run(run: RunDir) -> Trained:
     return load_policies(run.policy_path)
 
 
-def save_actors(run: RunDir, to: Path) -> None:
-    """Write a run's policies to another file without their critics: enough to act.
+def save_actors(policies: Path, to: Path) -> None:
+    """Write policies to another file without their critics: enough to act.
 
     Raises:
         CheckpointError: the policies are damaged, or the file cannot be written.
     """
-    trained = load_run(run)
-    checkpoint.save(to, {"actor": trained.params["actor"]}, checkpoint.load_arrays(run.policy_path)[1])
+    trained = load_policies(policies)
+    checkpoint.save(to, {"actor": trained.params["actor"]}, checkpoint.load_arrays(policies)[1])
 
 
 def finished_runs(row: str, runs: Path) -> list[RunDir]:
@@ -268,8 +268,11 @@ def _refuse_other_places(address: str) -> None:
 
 
 def _find(experiment: Experiment, runs: Path) -> Trained:
-    """The newest finished run with these fields, else packaged weights that have them."""
-    for run in _finished(experiment, runs):
+    """The newest finished run with these fields, else packaged weights that have them.
+
+    A report's results keep the policies of one run of a row: those without come last, and are then missed aloud.
+    """
+    for run in sorted(_finished(experiment, runs), key=lambda run: not run.policy_path.is_file()):
         return load_run(run)
     row = experiment.name
     if packaged(row).is_file():

@@ -1,0 +1,182 @@
+"""The paper in its own order, sentence by sentence (shortened): which claims, figures and numbers answer it.
+
+Where a sentence compares nothing, the answer says how it is built here, or shows the rows it is about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from footwork.statistics import iqm
+from footwork.study.claims import Judgement, show_effect
+from footwork.study.experiments import GRIDS, is_row
+from footwork.study.results import METRICS, Results
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Rows side by side in one metric, each with its interquartile mean."""
+
+    metric: str
+    rows: tuple[tuple[str, str], ...]  # label and address
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A sentence of the paper, and where the report answers it.
+
+    Args:
+        section: of the paper.
+        words: what it says.
+        claims: by number.
+        figures: of the report, by number.
+        shows: rows that it is about.
+        built: how it is done here, where that is the answer.
+    """
+
+    section: str
+    words: str
+    claims: tuple[int, ...] = ()
+    figures: tuple[int, ...] = ()
+    shows: tuple[Shown, ...] = ()
+    built: str = ""
+
+
+def _grid(metric: str, *names: str) -> tuple[Shown, ...]:
+    """The points of grids, labelled with their values."""
+    grids = [next(grid for grid in GRIDS if grid.name == name) for name in names]
+    return tuple(
+        Shown(metric, tuple((f"{grid.name} {value}", row) for value, row in grid.points().items())) for grid in grids
+    )
+
+
+def _rows(metric: str, *rows: str) -> Shown:
+    return Shown(metric, tuple((row, row) for row in rows))
+
+
+_LENGTHS = tuple(f"ablation/{kind}/t" for kind in ("random-start", "random-repeated", "appropriate-bias"))
+
+ANSWERS: tuple[Answer, ...] = (
+    Answer(
+        "1",
+        "Without resetting joints, the hierarchy is able to navigate to a given goal",
+        figures=(15, 16),
+        shows=tuple(
+            _rows("success", *(f"{place}/{kind}" for kind in ("paper/appropriate-bias", "hrl/appropriate-bias")))
+            for place in ("bandit", "maze")
+        ),
+        built="no joint is reset but at the start of an episode",
+    ),
+    Answer(
+        "3.1",
+        "AntWalker: four directions, targets 10 km away; 32 observations, 8 torques (Figure 1)",
+        figures=(1,),
+        built="as described",
+    ),
+    Answer(
+        "3.2",
+        "AntBandit: one of the four corners of a square; 36 observations (Figure 2)",
+        figures=(2,),
+        built="as described",
+    ),
+    Answer(
+        "3.3",
+        "AntMaze: a fixed point in a maze; 34 observations (Figure 3)",
+        figures=(3,),
+        built="as described; the walls' places are read off the figure",
+    ),
+    Answer(
+        "3.4",
+        "The vanilla ant in PyBullet is heavier than MuJoCo's, which makes it harder",
+        figures=(19,),
+        shows=(
+            _rows("speed", "walker/plain", "light/walker/plain", "bullet/walker/plain"),
+            _rows("handover", "walker/plain", "light/walker/plain", "bullet/walker/plain"),
+        ),
+        built="walker/... is the heavy ant on MuJoCo; light/... MuJoCo's own; bullet/... the heavy one on PyBullet",
+    ),
+    Answer(
+        "4", "Every k steps the master decides which policy runs next (Figure 4)", figures=(4,), built="as described"
+    ),
+    Answer(
+        "4",
+        "k is a hyperparameter (not stated)",
+        figures=(13,),
+        shows=_grid("success", "ablation/bandit/k", "ablation/maze/k", "ablation/maze/k-paper"),
+        built="k = 50, and a grid around it",
+    ),
+    Answer(
+        "4, 5",
+        "Mean and variance of the actions are learned functions of the state; two tanh layers of 64",
+        built="as described, for actors and critics",
+    ),
+    Answer("6", "The agent consistently fails to transition to an orthogonal policy", (12,), (11,)),
+    Answer(
+        "6",
+        "Random start, random repeated, appropriate bias: t timesteps (not stated)",
+        figures=(14,),
+        shows=_grid("handover", *_LENGTHS),
+    ),
+    Answer("6", "Appropriate bias seems to work best", (10,), (11, 12)),
+    Answer("6", "Transitions take place successfully almost always", (11,), (11,)),
+    Answer(
+        "7",
+        "S, I, B of Tables 1 and 2; create B = 32 batches (a number, or a size?)",
+        figures=(19,),
+        shows=(
+            *_grid("return", "ablation/walker/B-as-size"),
+            *_grid("way", "ablation/bandit/B-as-size", "ablation/maze/B-as-size"),
+        ),
+        built="a number; 32 as a size is an ablation",
+    ),
+    Answer("8", "Stability penalties while training the master do not make a difference", (13,)),
+    Answer("8", "The regularised hierarchy outperforms the flat policies (Figures 5, 6)", (1, 2), (5, 6, 15, 18)),
+    Answer("8", "Flat policies without stability penalties perform better than with them", (3,), (5, 6)),
+    Answer("8", "Unregularised sub-policies show a considerably smaller variance (Figures 7, 8)", (6,), (7, 8)),
+    Answer("8", "Unregularised policies achieve higher rewards eventually", (5,), (7, 8)),
+    Answer("8", "... but do not allow smooth transitions", (12,), (11, 12)),
+    Answer("8", "Regularised sub-policies serve as much better slaves (Figures 9, 10)", (7, 8), (9, 10, 16)),
+    Answer("8", "The difference is much more pronounced on AntMaze", (9,), (9, 10)),
+    Answer("9", "Moving straight to the target, the flat policy gets stuck in a wall", (4,), (16, 17)),
+    Answer("ours", "Interleaved sub-policies; one symmetric policy", (14, 15), (11, 12)),
+)
+
+
+def said(answer: Answer, judgements: Sequence[Judgement], results: Results) -> str:
+    """The answer in lines: how it is built, the verdicts with their effects, the rows that are shown."""
+    lines = [answer.built] if answer.built else []
+    lines += [_verdict(j) for j in judgements if j.claim.number in answer.claims]
+    lines += [line for shown in answer.shows if (line := _side_by_side(shown, results))]
+    return "\n".join(lines) or "see the figure"
+
+
+def _verdict(judgement: Judgement) -> str:
+    effects = [f"{f.contrast.words} {show_effect(f)}" for f in judgement.findings if f.contrast.decides and f.effect]
+    return (
+        f"claim {judgement.claim.number} ({judgement.where}): {judgement.verdict} "
+        f"({'; '.join([*effects, judgement.why])})"
+    )
+
+
+def _side_by_side(shown: Shown, results: Results) -> str:
+    """The rows that have runs; those without are named together."""
+    metric = METRICS[shown.metric]
+    measured, missing = [], []
+    for label, row in shown.rows:
+        scores = results.scores(row, shown.metric) if is_row(row) else ()
+        if len(scores):
+            measured.append(f"{label}: {metric.show(float(iqm(scores)))} ({seeds_in_words(len(scores))})")
+        else:
+            missing.append(label)
+    parts = [", ".join(measured)] if measured else []
+    parts += [f"no runs of {', '.join(missing)}"] if missing else []
+    return f"{metric.words}: {'; '.join(parts)}"
+
+
+def seeds_in_words(count: int | str) -> str:
+    """``1 seed``, ``2 seeds``, ``3 / 10 seeds``."""
+    return f"{count} seed{'' if str(count) == '1' else 's'}"
+
+
+__all__ = ["ANSWERS", "Answer", "Shown", "said", "seeds_in_words"]

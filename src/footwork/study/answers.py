@@ -11,15 +11,22 @@ from dataclasses import dataclass
 from footwork.statistics import iqm
 from footwork.study.claims import Judgement, show_effect
 from footwork.study.experiments import GRIDS, is_row
-from footwork.study.results import METRICS, Results
+from footwork.study.results import METRICS, Results, seeds_in_words
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Rows side by side in one metric, each with its interquartile mean."""
+    """Rows side by side in one metric, each with its interquartile mean.
+
+    Args:
+        metric: a key of METRICS.
+        rows: label and address of each.
+        where: the grid that the labels are values of.
+    """
 
     metric: str
-    rows: tuple[tuple[str, str], ...]  # label and address
+    rows: tuple[tuple[str, str], ...]
+    where: str = ""
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,8 @@ def _grid(metric: str, *names: str) -> tuple[Shown, ...]:
     """The points of grids, labelled with their values."""
     grids = [next(grid for grid in GRIDS if grid.name == name) for name in names]
     return tuple(
-        Shown(metric, tuple((f"{grid.name} {value}", row) for value, row in grid.points().items())) for grid in grids
+        Shown(metric, tuple(("as it is" if v is None else str(v), row) for v, row in grid.points().items()), grid.name)
+        for grid in grids
     )
 
 
@@ -161,7 +169,7 @@ def _verdict(judgement: Judgement) -> str:
 
 def _side_by_side(shown: Shown, results: Results) -> str:
     """The rows that have runs; those without are named together."""
-    metric = METRICS[shown.metric]
+    metric, grid = METRICS[shown.metric], f"{shown.where}, " if shown.where else ""
     measured, missing = [], []
     for label, row in shown.rows:
         scores = results.scores(row, shown.metric) if is_row(row) else ()
@@ -170,13 +178,8 @@ def _side_by_side(shown: Shown, results: Results) -> str:
         else:
             missing.append(label)
     parts = [", ".join(measured)] if measured else []
-    parts += [f"no runs of {', '.join(missing)}"] if missing else []
-    return f"{metric.words}: {'; '.join(parts)}"
+    parts += [f"no runs of {', '.join(missing)}" if measured or not grid else "no runs"] if missing else []
+    return f"{grid}{metric.words}: {'; '.join(parts)}"
 
 
-def seeds_in_words(count: int | str) -> str:
-    """``1 seed``, ``2 seeds``, ``3 / 10 seeds``."""
-    return f"{count} seed{'' if str(count) == '1' else 's'}"
-
-
-__all__ = ["ANSWERS", "Answer", "Shown", "said", "seeds_in_words"]
+__all__ = ["ANSWERS", "Answer", "Shown", "said"]

@@ -40,7 +40,7 @@ from footwork.statistics import (
     spread,
 )
 from footwork.study.experiments import MAIN, find_row, is_row
-from footwork.study.results import METRICS, Results
+from footwork.study.results import METRICS, Results, seeds_in_words
 
 Rule = Literal["greater", "not worse", "same", "at least", "at most"]
 Verdict = Literal["holds", "does not hold", "undecided"]
@@ -444,7 +444,7 @@ def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
     fewest = min(min(f.seeds) for f in deciding)
     if fewest < claim.min_seeds:
         so_far = _overall([f.so_far for f in deciding])
-        return f"{fewest} seed{'' if fewest == 1 else 's'}, {claim.min_seeds} are asked for; so far: {so_far}"
+        return f"{seeds_in_words(fewest)}, {claim.min_seeds} are asked for; so far: {so_far}"
     return "the interval allows both"
 
 

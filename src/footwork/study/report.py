@@ -21,13 +21,13 @@ import numpy as np
 import footwork
 from footwork.checkpoint import write_atomically
 from footwork.statistics import iqm
-from footwork.study.answers import ANSWERS, said, seeds_in_words
+from footwork.study.answers import ANSWERS, said
 from footwork.study.claims import CLAIMS, Finding, Judgement, judge_all, prefixes_at_hand, rows_read, show_effect
 from footwork.study.experiments import EXPERIMENTS, find_row, is_row
 from footwork.study.figures import FIGURES, Drawn, draw_figures
 from footwork.study.measure import EVALUATION, TRANSITIONS
 from footwork.study.plan import STUDY_FILE, read_machine
-from footwork.study.results import CURVE, METRICS, Results, write_curve
+from footwork.study.results import CURVE, METRICS, Results, seeds_in_words, write_curve
 from footwork.study.runs import NEEDED, save_actors
 from footwork.train import planned_steps
 

@@ -352,6 +352,11 @@ def _handover(results: Results, sample: Sample) -> float | None:
     return float(np.mean([entry["handover"][i][j]["success"] for i, j in pairs]))
 
 
+def seeds_in_words(count: int | str) -> str:
+    """``1 seed``, ``2 seeds``, ``3 / 10 seeds``."""
+    return f"{count} seed{'' if str(count) == '1' else 's'}"
+
+
 METRICS: dict[str, Metric] = {
     "way": Metric("share of the straight-line way to the goal", lambda r, s: _evaluated("way", r, s), True),
     "success": Metric("episodes that come within 1 m of the goal", lambda r, s: _evaluated("success", r, s), True),
@@ -375,4 +380,5 @@ __all__ = [
     "final",
     "find_samples",
     "read_curve",
+    "seeds_in_words",
 ]

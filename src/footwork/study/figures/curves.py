@@ -12,7 +12,7 @@ from footwork.arena import DIRECTIONS, shortest_path
 from footwork.palette import DIRECTION_COLOURS
 from footwork.statistics import DRAWS, Floats, curve_band, generator_for
 from footwork.study.figures.style import empty, label_of, legend_below, look_of, panels
-from footwork.study.results import Curve, Results, Sample
+from footwork.study.results import Curve, Results, Sample, seeds_in_words
 from footwork.train import Experiment
 
 _POINTS = 100
@@ -113,7 +113,7 @@ def direction_curves(results: Results, rows: tuple[str, ...]) -> Any:
                 ys = [curve.values["return"][:, i] for _, curve in curves]
                 line = ("-", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1)))[i]
                 draw_curve(ax, xs, ys, f"{row} {direction}", DIRECTION_COLOURS[i], line, direction)
-        ax.set_title(f"{row}\n{_count(len(curves))}")
+        ax.set_title(f"{row}\n({seeds_in_words(len(curves))})")
         ax.set_xlabel("control steps per direction")
         _plain_steps(ax)
         if not curves:
@@ -145,7 +145,3 @@ def _plain_steps(ax: Any) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.xaxis.set_major_formatter(lambda x, _: f"{x / 1e6:g} M" if x else "0")
     ax.set_xlim(left=0)
-
-
-def _count(seeds: int) -> str:
-    return f"({seeds} seed{'' if seeds == 1 else 's'})"

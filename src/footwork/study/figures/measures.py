@@ -11,7 +11,7 @@ from footwork.statistics import Effect, contrast, generator_for, performance_pro
 from footwork.study.experiments import GRIDS, Grid
 from footwork.study.figures.style import Look, empty, interval_marks, label_of, legend_below, look_of, panels
 from footwork.study.measure import TRANSITIONS
-from footwork.study.results import METRICS, Results
+from footwork.study.results import METRICS, Results, seeds_in_words
 
 _ARROWS = dict(zip(DIRECTIONS, ("→", "↑", "←", "↓"), strict=True))
 
@@ -23,7 +23,7 @@ def handover_maps(results: Results, rows: tuple[str, ...]) -> Any:
     for ax, row in zip(axes.flat, rows, strict=False):
         entries = results.measurements(row, TRANSITIONS)
         ax.grid(False)
-        ax.set_title(f"{row.removeprefix('walker/')}\n{len(entries)} seeds", fontsize=8)
+        ax.set_title(f"{row.removeprefix('walker/')}\n{seeds_in_words(len(entries))}", fontsize=8)
         if not entries:
             ax.axis("off")
             empty(ax, "no finished runs yet")

@@ -19,9 +19,8 @@ from footwork.arena import DIRECTIONS, Arena
 from footwork.evaluate import Episodes
 from footwork.palette import DIRECTION_COLOURS, FLAT_COLOUR, GOAL_COLOUR
 from footwork.study.experiments import find_row
-from footwork.study.figures.style import empty
 from footwork.study.measure import EVALUATION, STUCK_WITHIN, straight_line_stop
-from footwork.study.results import Results
+from footwork.study.results import Results, seeds_in_words
 
 _WALL_COLOUR = "#4A4E57"
 
@@ -126,7 +125,7 @@ def maze_paths(results: Results, rows: tuple[str, ...]) -> Any:
     for ax, row in zip(axes.flat, rows, strict=False):
         entry = next(iter(results.measurements(row, EVALUATION)), None)
         if entry is None:
-            empty(ax, "no finished runs yet")
+            ax.set_xticks([])
         for path in [] if entry is None else entry["paths"]:
             points = np.array(path["xy"])
             if not path["choices"]:
@@ -137,8 +136,8 @@ def maze_paths(results: Results, rows: tuple[str, ...]) -> Any:
             ax.add_collection(LineCollection(list(segments), colors=colours, linewidths=1.1, alpha=0.8))
         _draw_arena(ax, find_row(row).task.arena, None)
         _crop(ax, find_row(row).task.arena)
-        within = "" if entry is None else f"\n{100 * entry['success']['1.0']:.0f} % within 1 m"
-        ax.set_title(row + within, fontsize=8)
+        words = "no finished runs yet" if entry is None else f"{100 * entry['success']['1.0']:.0f} % within 1 m"
+        ax.set_title(f"{row}\n{words}", fontsize=8)
     for ax in axes.flat[len(rows) :]:
         ax.axis("off")
     handles = [
@@ -162,6 +161,7 @@ def flat_ends(results: Results, rows: tuple[str, ...]) -> Any:
         if stop is not None:
             ax.add_patch(Circle(stop, STUCK_WITHIN, fc="none", ec="#E69F00", lw=1.5, zorder=6))
         share = np.mean([entry["stuck"] for entry in entries]) if entries else None
-        words = "no finished runs yet" if share is None else f"{100 * share:.0f} % in the circle, {len(entries)} seeds"
+        seeds = seeds_in_words(len(entries))
+        words = "no finished runs yet" if share is None else f"{100 * share:.0f} % in the circle, {seeds}"
         ax.set_title(f"{row.removeprefix('maze/')}\n{words}", fontsize=8)
     return figure

@@ -37,7 +37,7 @@ def test_a_run_directory_tells_what_it_was_made_with(run):
     assert again.config() == CONFIG
     stored = json.loads((run.path / "config.json").read_text())["versions"]
     assert stored == record.versions()
-    assert set(stored) == {"footwork", "python", "jax", "mujoco", "numpy", "platform"}
+    assert set(stored) == {"footwork", "source", "python", "jax", "mujoco", "numpy", "platform"}
 
 
 def test_a_run_is_never_overwritten(run):

@@ -157,8 +157,15 @@ def test_curves_are_the_runs_metrics_in_bins(study):
     run.metrics_path.unlink()  # what is kept of the curve is enough, and nearly the same
     kept = results.read_curve(run, experiment)
     np.testing.assert_allclose(kept.values["return"], curve.values["return"], rtol=1e-4)
+    other = fake_run(study, "walker/plain", 1)  # a curve of another run is no curve of this one
+    results.read_curve(RunDir(other), experiment)
+    shutil.copyfile(other / results.CURVE, path / results.CURVE)
+    for _ in range(2):
+        with pytest.raises(RunError, match=r"curve\.json is damaged, or of another run.*metrics\.jsonl is not there"):
+            results.read_curve(run, experiment)
+        (path / results.CURVE).write_bytes((other / results.CURVE).read_bytes()[:-9])
     (path / results.CURVE).unlink()
-    with pytest.raises(RunError, match=r"metrics\.jsonl is missing"):
+    with pytest.raises(RunError, match=r"curve\.json is missing, and .*metrics\.jsonl is not there"):
         results.read_curve(run, experiment)
 
 
@@ -175,6 +182,7 @@ def test_what_does_not_count_is_left_out_by_name(study):
     config["versions"]["footwork"] = "9.9"
     write(paths[4] / "config.json", config)
     shutil.copytree(paths[5], paths[5].with_name("seeds-5"))
+    write(fake_run(study, row, 6) / "DONE", {})
     found = results.Results(study)
     assert [sample.seed for sample in found.samples(row)] == [0, 5]
     for words in (
@@ -183,6 +191,7 @@ def test_what_does_not_count_is_left_out_by_name(study):
         "seed-3 is 500,000 steps long, maze/flat/free takes 9,998,336",
         "seed-4 is of another version of footwork (9.9)",
         f"seeds-5: seed 5 is in {paths[5]} too",
+        "seed-6/DONE is damaged or of another version of footwork: it does not say steps",
     ):
         assert any(words in problem for problem in found.problems), words
     assert [sample.seed for sample in results.Results(study, any_length=True).samples(row)] == [0, 3, 5]
@@ -199,6 +208,12 @@ def test_what_does_not_count_is_left_out_by_name(study):
             lambda path: write(path, {**json.loads(path.read_text()), "row": "maze/flat/penalised"}),
             "the run is of maze",
         ),
+        (lambda path: write(path, {**json.loads(path.read_text()), "size": "quick"}), "is of the quick study"),
+        (
+            lambda path: write(path, {**json.loads(path.read_text()), "by_seed": [{"seed": 0, "way": 0.5}]}),
+            "of another version of footwork: it does not say success, stuck, ends",
+        ),
+        (lambda path: write(path, {**json.loads(path.read_text()), "by_seed": [3]}), "holds no entries"),
     ],
 )
 def test_damaged_measurements_are_named_and_how_to_make_them_again(study, damage, message):
@@ -209,6 +224,57 @@ def test_damaged_measurements_are_named_and_how_to_make_them_again(study, damage
     (problem,) = found.problems
     assert message in problem
     assert "footwork reproduce --rows maze/flat/free makes it again" in problem
+
+
+def test_folders_that_no_row_would_find_are_named(study):
+    fake_run(study, "maze/flat/free", 0)
+    fake_run(study, "maze/flat/free", 1).joinpath("config.json").unlink()
+    fake_run(study, "walker/plain", 0).rename(study.runs / "walker" / "plainn")
+    shutil.copytree(study.runs / "maze", study.runs / "mase")
+    found = results.strays(study)
+    assert len(found) == 4
+    for words in ("seed-1 has no config.json", "walker/plainn lies where no row", "mase/flat/free/seed-0 lies where"):
+        assert any(words in problem for problem in found), words
+    assert not any("maze/flat/free/seed-0" in problem for problem in found)
+
+
+@pytest.mark.parametrize("inside", ["results", "results/full", "results/a/b"])
+def test_a_report_never_costs_the_runs_that_it_is_made_from(study, inside, tmp_path, capsys):
+    fill(study, ("walker/plain",), 2)
+    (tmp_path / "out" / inside).parent.mkdir(parents=True)
+    runs = study.runs.rename(tmp_path / "out" / inside)
+    before = sorted(path for path in runs.rglob("*") if path.is_file())
+    status = run(["report", "--runs", str(runs), "--to", str(tmp_path / "out")])
+    assert status == (0 if inside == "results" else 1)
+    if status:
+        assert "would be replaced, and the runs in" in capsys.readouterr().err
+    assert set(before) <= {path for path in runs.rglob("*") if path.is_file()}
+
+
+def test_a_report_replaces_what_a_report_wrote_and_nothing_else(study, tmp_path, capsys, monkeypatch):
+    fill(study, ("walker/plain",), 2)
+    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
+    to = tmp_path / "out"
+    (to / "results").mkdir(parents=True)
+    (to / "results" / "mine.txt").write_text("years of work")
+    assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 1
+    assert "results holds something that no report wrote" in capsys.readouterr().err
+    (to / "results" / "mine.txt").unlink()
+    (study.runs / "walker/plain/seed-1/policy.safetensors").write_bytes(b"torn")  # it is missed, and said, no more
+    for _ in range(2):
+        assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 0
+        assert len(list((to / "results").rglob("DONE"))) == 2
+        assert not list(to.glob(".results*"))
+        assert "the report's results lack it" in (to / "REPORT.md").read_text()
+
+
+def test_a_report_of_nothing_is_refused_with_the_reasons(study, tmp_path, capsys):
+    study.runs.mkdir(parents=True, exist_ok=True)
+    fake_run(study, "walker/plain", 0).joinpath("DONE").unlink()
+    assert run(["report", "--runs", str(study.runs), "--to", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr()
+    assert "no finished run of any row counts in" in said.err
+    assert "seed-0 is not finished" in said.out
 
 
 def test_mixed_runs_are_named(study):

@@ -24,6 +24,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import functools
+import hashlib
 import importlib.metadata
 import io
 import json
@@ -57,6 +59,10 @@ _Config = TypeVar("_Config")
 
 class RunError(ValueError):
     """A run directory cannot be used as asked. One line, naming the directory or file."""
+
+
+class RunInUse(RunError):
+    """Another live process has the directory."""
 
 
 class Latest(NamedTuple):
@@ -167,7 +173,8 @@ class RunDir:
         """Keep every other live process out; a killed process lets go by dying.
 
         Raises:
-            RunError: another process has the directory (named by its id), or it cannot be locked.
+            RunInUse: another process has the directory; named by its id.
+            RunError: it cannot be locked.
         """
         try:
             descriptor = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT, 0o666)
@@ -384,14 +391,28 @@ def config_from_json(cls: type[_Config], data: Any) -> _Config:
 
 
 def versions() -> dict[str, str]:
-    """Of what a run's numbers depend on: the package, Python, the libraries and the platform."""
-    found = {"footwork": str(getattr(footwork, "__version__", "unknown")), "python": platform.python_version()}
+    """Of what a run's numbers depend on: the package, its source, Python, the libraries and the platform."""
+    found = {
+        "footwork": str(getattr(footwork, "__version__", "unknown")),
+        "source": source_digest(),
+        "python": platform.python_version(),
+    }
     for name in ("jax", "mujoco", "numpy"):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
     return {**found, "platform": platform.platform()}
+
+
+@functools.cache
+def source_digest() -> str:
+    """Eight digits that change with any line of the package's Python code: two checkouts of one version differ."""
+    package = Path(footwork.__file__).parent
+    digest = hashlib.blake2b(digest_size=4)
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
 
 
 class Progress:
@@ -465,7 +486,7 @@ def _take(descriptor: int, path: Path) -> None:
     except BlockingIOError:
         holder = os.pread(descriptor, 32, 0).decode(errors="replace").strip()
         who = f"process {holder}" if holder else "another process"
-        raise RunError(f"run directory {path} is in use by {who}") from None
+        raise RunInUse(f"run directory {path} is in use by {who}") from None
     except OSError as error:
         raise RunError(f"cannot lock run directory {path}: {error.strerror or error}") from error
     with contextlib.suppress(OSError):  # the lock holds without the number too
@@ -637,9 +658,11 @@ __all__ = [
     "Progress",
     "RunDir",
     "RunError",
+    "RunInUse",
     "config_from_json",
     "config_to_json",
     "read_metrics",
+    "source_digest",
     "truncate_metrics",
     "versions",
 ]

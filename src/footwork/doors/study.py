@@ -11,8 +11,8 @@ from footwork.study.claims import judge_all, rows_read
 from footwork.study.experiments import is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
 from footwork.study.plan import FULL, QUICK, Study, default_rows, mark, plan, read_mark
-from footwork.study.report import write_report
-from footwork.study.results import Results
+from footwork.study.report import all_rows, check_place, write_report
+from footwork.study.results import Results, strays
 from footwork.study.sweep import run_study
 
 if TYPE_CHECKING:
@@ -30,11 +30,13 @@ def reproduce(command: Reproduce) -> int:
     if command.plan:
         tables.show(tables.plan_table(jobs, size.name))
         return 0
+    to = command.to or Path(f"report{ending}")
+    check_place(study.runs, to)
     mark(study)
     board = run_study(study, jobs, command.workers, command.launcher, command.address, log=_say)
-    status = report(study.runs, command.to or Path(f"report{ending}"), command=_line(command))
     for job, reason in board.failed.items():
         _say(f"{job.name}: FAILED: {reason}")
+    status = report(study.runs, to, command=_line(command))
     return 1 if board.failed else status
 
 
@@ -67,6 +69,9 @@ def figures(names: tuple[str, ...], runs: Path, to: Path, under: str, any_length
 def report(runs: Path, to: Path, any_length: bool = False, command: str = "") -> int:
     """Write the report, and show its claims."""
     results = _results(runs, any_length)
+    if not any(results.samples(row) for row in all_rows(results)):
+        _say_problems(results)
+        raise RunError(f"no finished run of any row counts in {runs}: there is nothing to report")
     pages = write_report(results, to, command or f"footwork report{' --any-length' if any_length else ''}")
     tables.show(tables.claims_table(judge_all(results), results.study.size.name))
     _say_problems(results)
@@ -78,7 +83,9 @@ def report(runs: Path, to: Path, any_length: bool = False, command: str = "") ->
 def _results(runs: Path, any_length: bool) -> Results:
     if not runs.is_dir():
         raise RunError(f"there is no folder of runs at {runs}")
-    return Results(Study(runs, read_mark(runs)), any_length)
+    results = Results(Study(runs, read_mark(runs)), any_length)
+    results.problems.update(dict.fromkeys(strays(results.study)))
+    return results
 
 
 def _say_problems(results: Results) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from footwork import checkpoint
-from footwork.record import RunDir, RunError, config_to_json
+from footwork.record import RunDir, RunError, RunInUse, config_to_json
 from footwork.study.measure import measure, measured
 from footwork.study.plan import Job, Size, Study
 from footwork.study.results import find_samples, read_curve
@@ -40,7 +40,7 @@ def completed(study: Study, jobs: Sequence[Job]) -> tuple[set[Job], list[str]]:
     done, problems = set(), []
     for row in dict.fromkeys(job.row for job in jobs):
         samples, left_out = find_samples(study, row)
-        problems += [problem for problem in left_out if "is not finished" not in problem]
+        problems += [run.why for run in left_out if not run.unfinished]
         runs = {sample.seed: sample.run for sample in samples}
         mine = [job for job in jobs if job.row == row and job.seed in runs]
         done |= {job for job in mine if measured(runs[job.seed], study.row(row), study.size)}
@@ -108,8 +108,8 @@ def main(arguments: list[str]) -> int:
         except Interrupted as error:
             print(error, file=sys.stderr)
             return STOPPED
-        except RunError as error:
-            if "is in use" not in str(error) or time.monotonic() > deadline:
+        except RunInUse as error:
+            if time.monotonic() > deadline:
                 return _failed(error)
             time.sleep(0.5)
         except (ValueError, OSError, TrainingDiverged) as error:

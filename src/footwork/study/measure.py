@@ -10,6 +10,7 @@ checkpoints, are enough to draw and to judge it again.
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -30,6 +31,9 @@ EVALUATION_SEED = 1_000_003  # of the episodes; the run's seed is added
 STUCK_WITHIN = 1.0  # m around the point where the straight line to the goal meets a wall
 KEPT_PATHS = 12  # episodes per seed whose paths are kept
 _KEPT_POINTS = 100  # of a path, at most
+_OF_WALKERS = ("seed", "speed_mps", "fall_rate", "flip_rate")
+_OF_TASKS = ("seed", "success", "way", "stuck", "ends", "paths", "fall_rate", "flip_rate")
+_OF_TRANSITIONS = ("seed", "handover", "switching")
 
 
 def files_of(experiment: Experiment) -> tuple[str, ...]:
@@ -59,6 +63,18 @@ def problem_with(run: RunDir, name: str, size: Size | None = None) -> str | None
         return f"{path} is of a policy {content.get('steps')} steps old, the run has {run.summary().get('steps')}"
     if size is not None and content.get("size") != size.name:
         return f"{path} is of the {content.get('size')} study, not of the {size.name} one"
+    return _lacks(path, content["by_seed"])
+
+
+def _lacks(path: Path, entries: Any) -> str | None:
+    """What no entry of a file of measurements can do without, and one does."""
+    for entry in entries if isinstance(entries, list) else [None]:
+        if not isinstance(entry, dict):
+            return f"{path} is damaged: it holds no entries"
+        wanted = _OF_TRANSITIONS if path.name == TRANSITIONS else _OF_WALKERS if "speed_mps" in entry else _OF_TASKS
+        missing = [name for name in wanted if name not in entry]
+        if missing:
+            return f"{path} is of another version of footwork: it does not say {', '.join(missing)}"
     return None
 
 

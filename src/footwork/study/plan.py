@@ -179,6 +179,8 @@ def read_mark(runs: Path) -> Size:
         return FULL
     try:
         content = json.loads(path.read_bytes())
+        if content["format"] != _FORMAT:
+            raise ValueError
         return SIZES[content["size"]]
     except (OSError, ValueError, KeyError, TypeError):
         raise RunError(f"{path} is damaged or of another version of footwork") from None

@@ -19,7 +19,9 @@ from pathlib import Path
 import numpy as np
 
 import footwork
-from footwork.checkpoint import write_atomically
+from footwork import checkpoint
+from footwork.checkpoint import CheckpointError, write_atomically
+from footwork.record import RunError
 from footwork.statistics import iqm
 from footwork.study.answers import ANSWERS, said
 from footwork.study.claims import CLAIMS, Finding, Judgement, judge_all, prefixes_at_hand, rows_read, show_effect
@@ -27,9 +29,12 @@ from footwork.study.experiments import EXPERIMENTS, find_row, is_row
 from footwork.study.figures import FIGURES, Drawn, draw_figures
 from footwork.study.measure import EVALUATION, TRANSITIONS
 from footwork.study.plan import STUDY_FILE, read_machine
-from footwork.study.results import CURVE, METRICS, Results, seeds_in_words, write_curve
-from footwork.study.runs import NEEDED, save_actors
+from footwork.study.results import CURVE, METRICS, Results, Sample, copy_curve, seeds_in_words
+from footwork.study.runs import NEEDED, read_actors
 from footwork.train import planned_steps
+
+RESULTS = "results"  # folder of a report, with the small files of its runs
+WRITTEN = "WRITTEN_BY_FOOTWORK_REPORT"  # in that folder: the next report may replace it
 
 
 @dataclass(frozen=True)
@@ -81,22 +86,27 @@ def write_report(results: Results, to: Path, command: str) -> list[Path]:
         command: the line that made this report.
 
     Raises:
+        RunError: see :func:`check_place`.
         OSError: it cannot be written.
+        CheckpointError: it cannot be written.
     """
+    check_place(results.study.runs, to)
     prefixes = prefixes_at_hand(results)
+    for row in all_rows(results):
+        results.samples(row)
     drawn = [one for prefix in prefixes for one in draw_figures(results, FIGURES, to / "figures", prefix)]
+    export(results, to / RESULTS)  # first: it may find what is wrong with a file, and the pages say so
     blocks = report_blocks(results, drawn, command)
     pages = {"REPORT.md": _markdown(blocks, to), "report.html": _page(blocks, _title(results))}
     for name, text in pages.items():
         write_atomically(to / name, text.encode())
-    export(results, to / "results")
     return [to / name for name in pages]
 
 
 def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> list[Block]:
     """The report, whatever it is to be written as."""
     judgements = judge_all(results)
-    rows = [row for row in _all_rows(results) if results.samples(row)]
+    rows = [row for row in all_rows(results) if results.samples(row)]
     blocks: list[Block] = [Heading(_title(results), 1), Text(_summary(results, judgements, rows))]
     if results.study.size.short is not None:
         blocks.append(
@@ -139,7 +149,7 @@ def _summary(results: Results, judgements: Sequence[Judgement], rows: Sequence[s
     return f"{len(CLAIMS)} claims in {len(judgements)} settings: {said}. {seeds} runs of {len(rows)} rows.{length}"
 
 
-def _all_rows(results: Results) -> list[str]:
+def all_rows(results: Results) -> list[str]:
     """The table, and the same under every engine or ant at hand."""
     elsewhere = [prefix + row for prefix in prefixes_at_hand(results) if prefix for row in EXPERIMENTS]
     known = [row for row in elsewhere if row not in EXPERIMENTS and is_row(row)]
@@ -248,6 +258,21 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     ]
 
 
+def check_place(runs: Path, to: Path) -> None:
+    """Refuse a folder for the report in which writing it would cost something that is not an older report's.
+
+    Raises:
+        RunError: ``to``/results holds the runs, or something that no report wrote.
+    """
+    place = to / RESULTS
+    if runs.resolve() == place.resolve():  # a report made again from its own files leaves them as they are
+        return
+    if runs.resolve().is_relative_to(place.resolve()):
+        raise RunError(f"{place} would be replaced, and the runs in {runs} are in it: choose another --to")
+    if place.exists() and not (place / WRITTEN).is_file() and (not place.is_dir() or any(place.iterdir())):
+        raise RunError(f"{place} holds something that no report wrote (it has no {WRITTEN}): choose another --to")
+
+
 def export(results: Results, to: Path) -> None:
     """Copy the small files of every run that was read: enough to draw and to judge again.
 
@@ -255,30 +280,49 @@ def export(results: Results, to: Path) -> None:
     on from a copy of this folder as it would from the runs themselves. Of every other row those of the first seed,
     with the sub-policies that it was trained on: so each row can be watched and evaluated from here.
 
+    What an earlier report wrote there stays until everything has been copied.
+
     Raises:
+        RunError: see :func:`check_place`.
         OSError: they cannot be written.
-        CheckpointError: a policy is damaged, or cannot be written.
+        CheckpointError: they cannot be written.
     """
+    check_place(results.study.runs, to.parent)
     if to.resolve() == results.study.runs.resolve():
         return
-    if to.is_dir():
-        shutil.rmtree(to)
+    new, old = to.with_name(f".{to.name}.new"), to.with_name(f".{to.name}.old")
+    for left in (new, old):
+        shutil.rmtree(left, ignore_errors=True)
+    new.mkdir(parents=True)
     for row, samples in results.all_samples().items():
-        for run, sample in {sample.run: sample for sample in samples}.items():
-            place = to / row / run.path.name
-            place.mkdir(parents=True, exist_ok=True)
-            for name in ("config.json", "DONE", EVALUATION, TRANSITIONS):
-                if (run.path / name).is_file():
-                    shutil.copyfile(run.path / name, place / name)
-            curve = results.whole_curve(sample)
-            if curve is not None:
-                write_curve(place / CURVE, curve, None)
-            if sample.experiment.is_walker or run == samples[0].run:
-                for path in (run.policy_path, run.path / NEEDED):
-                    if path.is_file() and not (path.name == NEEDED and sample.experiment.is_walker):
-                        save_actors(path, place / path.name)
+        for sample in {sample.run: sample for sample in samples}.values():
+            _copy_run(results, sample, new / row / sample.run.path.name, row, first=sample.run == samples[0].run)
     if (results.study.runs / STUDY_FILE).is_file():
-        shutil.copyfile(results.study.runs / STUDY_FILE, to / STUDY_FILE)
+        shutil.copyfile(results.study.runs / STUDY_FILE, new / STUDY_FILE)
+    (new / WRITTEN).write_text("footwork report wrote this folder, and the next one replaces it.\n", encoding="utf-8")
+    if to.exists():
+        to.rename(old)
+    new.rename(to)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _copy_run(results: Results, sample: Sample, place: Path, row: str, first: bool) -> None:
+    run, walker = sample.run, sample.experiment.is_walker
+    place.mkdir(parents=True, exist_ok=True)
+    for name in ("config.json", "DONE", EVALUATION, TRANSITIONS):
+        if (run.path / name).is_file():
+            shutil.copyfile(run.path / name, place / name)
+    curve = results.whole_curve(sample)
+    if curve is not None:
+        copy_curve(curve, run, sample.experiment, place / CURVE)
+    for path in (run.policy_path, *(() if walker else (run.path / NEEDED,))):
+        if (walker or first) and path.is_file():
+            try:
+                actors, meta = read_actors(path)
+            except CheckpointError as error:
+                results.problems[f"{error}: the report's results lack it"] = None
+                continue
+            checkpoint.save(place / path.name, actors, meta)
 
 
 # Markdown and HTML ----------------------------------------------------------------------------------------------------
@@ -381,4 +425,4 @@ def _inline(text: str) -> str:
     return "".join(parts)
 
 
-__all__ = ["export", "report_blocks", "write_report"]
+__all__ = ["all_rows", "check_place", "export", "report_blocks", "write_report"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,15 +21,17 @@ from footwork.arena import DIRECTIONS
 from footwork.checkpoint import CheckpointError, write_atomically
 from footwork.record import RunDir, RunError, config_from_json, read_metrics
 from footwork.statistics import Floats
+from footwork.study.experiments import is_row
 from footwork.study.measure import EVALUATION, TRANSITIONS, problem_with
 from footwork.study.plan import Study
 from footwork.train import Experiment, planned_steps, steps_per_iteration
 
 CURVE = "curve.json"
+RUN_FILES = ("config.json", "DONE", "metrics.jsonl", "policy.safetensors", EVALUATION)  # any of them: a run lies there
 BINS = 100  # points of a training curve
 LAST = 0.1  # share of training that "final" means
 SAME_LENGTH = 0.01  # of the row's steps, by which a run may differ: whole iterations have been rounded up and down
-_CURVE_FORMAT = 1
+_CURVE_FORMAT = 2
 _KEYS = {"return": "episode/return", "progress": "episode/progress"}  # means over a bin's episodes
 
 
@@ -50,6 +53,13 @@ class Sample:
     run: RunDir
     index: int  # of the seed in the run
     experiment: Experiment
+
+
+class LeftOut(NamedTuple):
+    """A run that does not count, and why."""
+
+    why: str
+    unfinished: bool = False
 
 
 @dataclass
@@ -75,9 +85,9 @@ class Results:
             ValueError: there is no such row.
         """
         if row not in self._samples:
-            found, problems = find_samples(self.study, row, self.any_length)
+            found, left_out = find_samples(self.study, row, self.any_length)
             self._samples[row] = found
-            self.problems.update(dict.fromkeys([*problems, *_mixed_versions(row, found)]))
+            self.problems.update(dict.fromkeys([*(run.why for run in left_out), *_mixed_versions(row, found)]))
         return self._samples[row]
 
     def curves(self, row: str) -> list[tuple[Sample, Curve]]:
@@ -100,8 +110,18 @@ class Results:
         Raises:
             ValueError: there is no such row or metric.
         """
-        measure = METRICS[metric]
-        return np.array([value for s in self.samples(row) if (value := measure.of(self, s)) is not None], np.float64)
+        return np.array(list(self.scores_by_seed(row, metric).values()), np.float64)
+
+    def scores_by_seed(self, row: str, metric: str) -> dict[int, Any]:
+        """A metric of each seed that has it.
+
+        Raises:
+            ValueError: there is no such row or metric.
+        """
+        if metric not in METRICS:
+            raise ValueError(f"unknown metric {metric!r}; known metrics: {', '.join(METRICS)}")
+        values = {sample.seed: METRICS[metric].of(self, sample) for sample in self.samples(row)}
+        return {seed: value for seed, value in values.items() if value is not None}
 
     def all_samples(self) -> dict[str, tuple[Sample, ...]]:
         """Every row that has been asked for so far, and its seeds."""
@@ -122,7 +142,7 @@ class Results:
         """What a file of measurements says of a sample; None, and a problem, where it cannot be read."""
         key = (sample.run.path, name)
         if key not in self._files:
-            problem = problem_with(sample.run, name)
+            problem = problem_with(sample.run, name, self.study.size)
             if problem:
                 self.problems[f"{problem}: footwork reproduce --rows {sample.row} makes it again"] = None
             self._files[key] = [] if problem else json.loads((sample.run.path / name).read_bytes())["by_seed"]
@@ -132,7 +152,7 @@ class Results:
         return found
 
 
-def find_samples(study: Study, row: str, any_length: bool = False) -> tuple[tuple[Sample, ...], list[str]]:
+def find_samples(study: Study, row: str, any_length: bool = False) -> tuple[tuple[Sample, ...], list[LeftOut]]:
     """The finished seeds of a row that count, and what does not and why.
 
     Where a seed is there twice, the run of that seed alone counts.
@@ -142,7 +162,7 @@ def find_samples(study: Study, row: str, any_length: bool = False) -> tuple[tupl
     """
     experiment = study.row(row)
     found: dict[int, Sample] = {}
-    problems = []
+    left_out: list[LeftOut] = []
     configs = sorted((study.runs / row).glob("*/config.json"), key=lambda path: ("seeds-" in path.parent.name, path))
     for path in configs:
         run = RunDir(path.parent)
@@ -150,22 +170,37 @@ def find_samples(study: Study, row: str, any_length: bool = False) -> tuple[tupl
             saved, seeds = _saved(run)
             problem = _why_not(run, saved, experiment, any_length)
         except ValueError as error:
-            problem = str(error)
+            problem = LeftOut(str(error))
         if problem:
-            problems.append(problem)
+            left_out.append(problem)
             continue
         for index, seed in enumerate(seeds):
             if seed in found:
-                problems.append(f"{run.path}: seed {seed} is in {found[seed].run.path} too, which counts")
+                left_out.append(LeftOut(f"{run.path}: seed {seed} is in {found[seed].run.path} too, which counts"))
                 continue
             found[seed] = Sample(row, seed, run, index, saved)
-    return tuple(found[seed] for seed in sorted(found)), problems
+    return tuple(found[seed] for seed in sorted(found)), left_out
+
+
+def strays(study: Study) -> list[str]:
+    """Folders that look like runs and that no row would ever find."""
+    problems = []
+    for place, _, files in sorted(os.walk(study.runs)):
+        if not any(name in files for name in RUN_FILES):
+            continue
+        path = Path(place)
+        row = path.parent.relative_to(study.runs).as_posix() if path != study.runs else ""
+        if not is_row(row):
+            problems.append(f"{path} lies where no row of this version has its runs: left out")
+        elif "config.json" not in files:
+            problems.append(f"{path} has no config.json: left out")
+    return problems
 
 
 def _mixed_versions(row: str, samples: tuple[Sample, ...]) -> list[str]:
-    """Runs of one row that other libraries made count all the same; it is said."""
+    """Runs of one row that other code or libraries made count all the same; it is said."""
     problems = []
-    for library in ("jax", "mujoco"):
+    for library in ("footwork", "source", "jax", "mujoco"):
         found = sorted({str(sample.run.versions().get(library, "unknown")) for sample in samples})
         if len(found) > 1:
             problems.append(f"runs of {row} were made with different versions of {library}: {', '.join(found)}")
@@ -186,14 +221,16 @@ def _saved(run: RunDir) -> tuple[Experiment, list[int]]:
         raise RunError(f"{run.path} is of another version of footwork ({version}): {error}") from None
 
 
-def _why_not(run: RunDir, saved: Experiment, row: Experiment, any_length: bool) -> str | None:
+def _why_not(run: RunDir, saved: Experiment, row: Experiment, any_length: bool) -> LeftOut | None:
     if replace(saved, total_steps=row.total_steps) != row:
-        return f"{run.path} was trained with other fields than {row.name} has now: left out"
+        return LeftOut(f"{run.path} was trained with other fields than {row.name} has now: left out")
     if not run.finished:
-        return f"{run.path} is not finished: left out"
-    steps = int(run.summary()["steps"])
+        return LeftOut(f"{run.path} is not finished: left out", unfinished=True)
+    steps = run.summary().get("steps")
+    if not isinstance(steps, int):
+        return LeftOut(f"{run.path / 'DONE'} is damaged or of another version of footwork: it does not say steps")
     if abs(steps - planned_steps(row)) > SAME_LENGTH * planned_steps(row) and not any_length:
-        return f"{run.path} is {steps:,} steps long, {row.name} takes {planned_steps(row):,}: left out"
+        return LeftOut(f"{run.path} is {steps:,} steps long, {row.name} takes {planned_steps(row):,}: left out")
     return None
 
 
@@ -208,12 +245,15 @@ def read_curve(run: RunDir, experiment: Experiment) -> Curve:
     """
     kept = run.path / CURVE
     size = run.metrics_path.stat().st_size if run.metrics_path.is_file() else None
+    whose = _whose(run, experiment)
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         content = json.loads(kept.read_bytes())
-        if content["format"] == _CURVE_FORMAT and size in (None, content["metrics_bytes"]):
+        same = content["format"] == _CURVE_FORMAT and content["of"] == whose
+        if same and size in (None, content["metrics_bytes"]):
             return _curve_from_json(content)
     if size is None:
-        raise RunError(f"{run.metrics_path} is missing")
+        what = "damaged, or of another run or version of footwork" if kept.is_file() else "missing"
+        raise RunError(f"{kept} is {what}, and {run.metrics_path} is not there to make it from")
     lines = read_metrics(run.metrics_path)
     end = run.summary()["steps"]
     if not lines or lines[-1]["step"] != end:
@@ -223,19 +263,34 @@ def read_curve(run: RunDir, experiment: Experiment) -> Curve:
         curve = _bin(lines, steps_per_iteration(experiment), len(run.config()["seeds"]))
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{run.metrics_path} is of another version of footwork: {error!r}") from None
-    curve = _curve_from_json(_curve_to_json(curve, size))  # rounded now as it will be when it is read again
+    curve = _curve_from_json(_curve_to_json(curve, whose, size))  # rounded now as it will be when it is read again
     with contextlib.suppress(CheckpointError):  # a folder that cannot be written is read again the next time
-        write_curve(kept, curve, size)
+        write_curve(kept, curve, whose, size)
     return curve
 
 
-def write_curve(path: Path, curve: Curve, metrics_bytes: int | None) -> None:
-    """Write a curve, and how large the file of metrics was that it was made from.
+def _whose(run: RunDir, experiment: Experiment) -> dict[str, Any]:
+    """What says that a curve is this run's."""
+    config, summary = run.config(), run.summary()
+    return {"row": experiment.name, "seeds": config.get("seeds"), "steps": summary.get("steps")}
+
+
+def copy_curve(curve: Curve, run: RunDir, experiment: Experiment, to: Path) -> None:
+    """Write a run's curve where its metrics are not.
 
     Raises:
         CheckpointError: it cannot be written.
     """
-    write_atomically(path, json.dumps(_curve_to_json(curve, metrics_bytes)).encode() + b"\n")
+    write_curve(to, curve, _whose(run, experiment), None)
+
+
+def write_curve(path: Path, curve: Curve, whose: dict[str, Any], metrics_bytes: int | None) -> None:
+    """Write a curve, whose it is, and how large the file of metrics was that it was made from.
+
+    Raises:
+        CheckpointError: it cannot be written.
+    """
+    write_atomically(path, json.dumps(_curve_to_json(curve, whose, metrics_bytes)).encode() + b"\n")
 
 
 def _bin(lines: list[dict[str, Any]], steps_per_line: int, num_seeds: int) -> Curve:
@@ -259,13 +314,14 @@ def _sum_of(lines: list[dict[str, Any]], key: str, count: Floats) -> Floats:
     return np.where(count > 0, mean, 0.0) * count
 
 
-def _curve_to_json(curve: Curve, metrics_bytes: int | None) -> dict[str, Any]:
+def _curve_to_json(curve: Curve, whose: dict[str, Any], metrics_bytes: int | None) -> dict[str, Any]:
     rounded = {
         name: [[None if np.isnan(x) else float(f"{x:.5g}") for x in row] for row in value]
         for name, value in curve.values.items()
     }
     return {
         "format": _CURVE_FORMAT,
+        "of": whose,
         "metrics_bytes": metrics_bytes,
         "step": curve.step.astype(int).tolist(),
         "seconds": np.round(curve.seconds, 1).tolist(),
@@ -320,8 +376,10 @@ class Metric:
 
 def _final_return(results: Results, sample: Sample) -> Any:
     curve = results.whole_curve(sample)
-    returns = None if curve is None else final(_of_seed(curve, sample), "return")
-    if returns is None or np.isnan(returns).any():
+    if curve is None:  # and it was said why
+        return None
+    returns = final(_of_seed(curve, sample), "return")
+    if np.isnan(returns).any():
         results.problems[f"{sample.run.path}: no episode ended in the last tenth of training"] = None
         return None
     return returns
@@ -374,11 +432,14 @@ __all__ = [
     "CURVE",
     "METRICS",
     "Curve",
+    "LeftOut",
     "Metric",
     "Results",
     "Sample",
+    "copy_curve",
     "final",
     "find_samples",
     "read_curve",
     "seeds_in_words",
+    "strays",
 ]

@@ -198,14 +198,13 @@ def load_run(run: RunDir) -> Trained:
     return load_policies(run.policy_path)
 
 
-def save_actors(policies: Path, to: Path) -> None:
-    """Write policies to another file without their critics: enough to act.
+def read_actors(policies: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Policies without their critics, enough to act, and what their file says of them.
 
     Raises:
-        CheckpointError: the policies are damaged, or the file cannot be written.
+        CheckpointError: the file is damaged or foreign.
     """
-    trained = load_policies(policies)
-    checkpoint.save(to, {"actor": trained.params["actor"]}, checkpoint.load_arrays(policies)[1])
+    return {"actor": load_policies(policies).params["actor"]}, checkpoint.load_arrays(policies)[1]
 
 
 def finished_runs(row: str, runs: Path) -> list[RunDir]:

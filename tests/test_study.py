@@ -141,6 +141,34 @@ def test_arrivals_by_hand():
 # ---------------------------------------------------------------- results
 
 
+def test_metrics_of_where_episodes_end(study):
+    """At the goal, at the wall, half-way around it, at the start: the straight line and the way around disagree."""
+    path = fake_run(study, "maze/flat/free", 0)
+    content = json.loads((path / "evaluation.json").read_text())
+    content["by_seed"][0]["ends"] = [[-4.0, 4.0], [-4.0, -2.5], [4.0, -4.0], [-4.0, -4.0]]
+    write(path / "evaluation.json", content)
+    score = {name: results.Results(study).scores("maze/flat/free", name) for name in ("route", "stuck close")}
+    score["at the start"] = results.Results(study).scores("maze/flat/free", "at the start")
+    whole = 17.99  # m around the wall
+    after_eight = 1 - (whole - 8) / whole
+    assert score["route"] == pytest.approx((1 + 0 + after_eight + 0) / 4, abs=0.05)
+    assert score["stuck close"] == 0.25
+    assert score["at the start"] == 0.25
+    fake_run(study, "bandit/flat/free", 0)
+    assert len(results.Results(study).scores("bandit/flat/free", "route")) == 0
+
+
+def test_fluctuation_is_not_fooled_by_a_trend(study, monkeypatch):
+    """Noise of a known deviation on a steep line: the line does not count."""
+    fake_run(study, "walker/plain", 0)
+    noise = np.random.default_rng(0).normal(0, 20.0, (100, 4))
+    line = np.linspace(0, 400, 100)[:, None] + noise
+    curve = results.Curve(np.arange(100.0), np.arange(100.0), np.ones((100, 4)), {"return": line})
+    monkeypatch.setattr(results, "read_curve", lambda run, experiment: curve)
+    (found,) = results.Results(study).scores("walker/plain", "fluctuation")
+    np.testing.assert_allclose(found, 20.0, rtol=0.35)
+
+
 def test_curves_are_the_runs_metrics_in_bins(study):
     path = fake_run(study, "walker/plain", 0, lines=40)
     run, experiment = RunDir(path), find_row("walker/plain")
@@ -360,9 +388,31 @@ def test_verdicts_need_ten_seeds_and_say_so(study):
     assert against_free.probability == 1.0
     assert against_free.seeds == (10, 10)
     assert verdicts(study, 2)[where] == enough  # the intervals are the same each time
-    missing = verdicts(study, 2)["mujoco, heavy ant, our reward and schedule"]
+    missing = verdicts(study, 2)["mujoco, heavy ant, our reward, our masters' schedule"]
     assert missing.verdict == "undecided"
     assert "no runs of maze/hrl/appropriate-bias" in missing.why
+
+
+def test_a_difference_of_the_other_sign_is_told_from_one_that_is_too_small(study):
+    fill(study, ("maze/flat/free", "bandit/flat/free", "bandit/flat/penalised"), 10, quality=0.3)
+    fill(study, ("maze/flat/penalised",), 10, quality=0.8)
+    found = verdicts(study, 3)["mujoco, heavy ant, the paper's reward and schedule"]
+    assert found.verdict == "does not hold"
+    assert found.why == "10 seeds or more on every side; the other way round: maze"
+    assert {f.contrast.metric for f in found.findings} == {"way", "success", "route"}
+
+
+def test_shown_comparisons_do_not_decide_and_rows_of_ablations_do_not_ask_for_ten_seeds(study):
+    fourteen = claims.CLAIMS[13]
+    shown = [row for c in fourteen.contrasts if not c.decides for row in c.rows if row.startswith("ablation/annealed/")]
+    assert len(shown) == 3
+    assert all(find_row(row).ppo.anneal_updates == find_row("walker/interleaved").ppo.anneal_updates for row in shown)
+    assert find_row("ablation/annealed/appropriate-bias").needs == "ablation/annealed/plain"
+    assert not any(row.startswith("ablation/") for row in claims.rows_read())
+    assert {"walker/plain", "walker/interleaved"} <= set(claims.rows_read())
+    fill(study, ("light/walker/plain",), 2)
+    light = verdicts(study, 14)["mujoco, light ant, our reward, our masters' schedule"]
+    assert not any("annealed" in finding.contrast.words for finding in light.findings)
 
 
 def test_verdicts_name_engine_and_ant_and_one_failing_comparison_is_enough(study):
@@ -381,7 +431,11 @@ def test_a_claim_about_variance_compares_spreads(study):
             fake_run(study, row, seed, quality=0.5 + (0.0 if i == 0 else 0.4 * (seed % 2) - 0.2))
     found = verdicts(study, 6)["mujoco, heavy ant"]
     assert found.verdict == "holds"
-    assert all(finding.probability > 0.7 for finding in found.findings)
+    assert all(finding.probability > 0.7 for finding in found.findings if finding.contrast.decides)
+    few = results.Results(Study(study.runs))
+    spreads = claims.CLAIMS[5].contrasts[0]
+    assert claims._probability(spreads, [np.zeros((2, 4)), np.zeros((10, 4))]) is None
+    assert few.scores("walker/plain", "fluctuation").shape == (10, 4)
 
 
 # ---------------------------------------------------------------- figures and the report

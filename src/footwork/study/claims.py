@@ -24,7 +24,7 @@ reward and schedule, the paper's or ours. A verdict names all of it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -39,7 +39,7 @@ from footwork.statistics import (
     probability_of_improvement,
     spread,
 )
-from footwork.study.experiments import MAIN, find_row, is_row
+from footwork.study.experiments import MAIN, SCHEDULES, find_row, is_row
 from footwork.study.results import METRICS, Results, seeds_in_words
 
 Rule = Literal["greater", "not worse", "same", "at least", "at most"]
@@ -143,18 +143,26 @@ def _same_way(words: str, one: str, other: str, rule: Rule) -> Contrast:
     return Contrast(words, (one, other), (1, -1), "way", rule, 0.05)
 
 
-def _success_too(contrasts: tuple[Contrast, ...]) -> tuple[Contrast, ...]:
-    """The same comparisons in success within 1 m, which the paper does not report: shown, not deciding."""
-    shown = (
-        Contrast(f"{c.words}, success", c.rows, c.weights, "success", c.rule, c.bound, c.statistic, decides=False)
-        for c in contrasts
-    )
+def _shown_too(contrasts: tuple[Contrast, ...]) -> tuple[Contrast, ...]:
+    """The same comparisons in two measures that the paper does not report: shown, not deciding.
+
+    Success within 1 m; and, on AntMaze, the way around the walls. The straight line, which the paper plots, calls an
+    ant that stands at the wall nearer to the goal than one that is half-way around it.
+    """
+    shown = []
+    for c in contrasts:
+        maze = all("maze/" in row for row in c.rows)
+        for metric in ("success", *(("route",) if maze else ())):
+            shown.append(replace(c, words=f"{c.words}, {_SHORT[metric]}", metric=metric, decides=False))
     return (*contrasts, *shown)
+
+
+_SHORT = {"success": "success", "route": "way around the walls"}
 
 
 def _beats_flat(place: str) -> tuple[Contrast, ...]:
     master = f"{place}/{{schedule}}/appropriate-bias"
-    return _success_too(
+    return _shown_too(
         (
             _way("against flat, penalised", master, f"{place}/flat/{{guided}}penalised"),
             _way("against flat, free", master, f"{place}/flat/{{guided}}free"),
@@ -168,7 +176,7 @@ def _serves_better(place: str) -> tuple[Contrast, ...]:
         _way(f"{kind} against plain", f"{place}/{{schedule}}/{kind}", plain, decides=kind == "appropriate-bias")
         for kind in reversed(PAPER_REGULARISERS)
     )
-    return _success_too(others[:1]) + others[1:]
+    return _shown_too(others[:1]) + others[1:]
 
 
 def _both(make: Callable[[str], tuple[Contrast, ...]]) -> tuple[Contrast, ...]:
@@ -193,14 +201,22 @@ CLAIMS: tuple[Claim, ...] = (
         3,
         "Flat policies without stability penalties beat those with them, on both tasks.",
         "8, Figures 5 and 6",
-        _both(lambda place: (_way(place, f"{place}/flat/{{guided}}free", f"{place}/flat/{{guided}}penalised"),)),
+        _shown_too(
+            _both(lambda place: (_way(place, f"{place}/flat/{{guided}}free", f"{place}/flat/{{guided}}penalised"),))
+        ),
     ),
     Claim(
         4,
         "On AntMaze the flat policy without penalties ends stuck behind a wall: most of its episodes end within "
         "1 m of where the straight line to the goal meets the wall.",
         "9",
-        (Contrast("share of episodes", ("maze/flat/free",), (1,), "stuck", "at least", 0.5),),
+        (
+            Contrast("share of episodes", ("maze/flat/free",), (1,), "stuck", "at least", 0.5),
+            Contrast("within 0.5 m of there", ("maze/flat/free",), (1,), "stuck close", "at least", 0.5, decides=False),
+            Contrast(
+                "within 0.5 m of the start", ("maze/flat/free",), (1,), "at the start", "at most", 0.5, decides=False
+            ),
+        ),
     ),
     Claim(
         5,
@@ -215,17 +231,31 @@ CLAIMS: tuple[Claim, ...] = (
         "The training reward of unregularised sub-policies varies less (standard deviation across seeds, "
         "within directions).",
         "8, Figures 7 and 8",
-        tuple(
-            Contrast(
-                f"{kind} less plain",
-                (f"walker/{kind}", "walker/plain"),
-                (1, -1),
-                "return by direction",
-                "greater",
-                50.0,
-                "spread",
-            )
-            for kind in PAPER_REGULARISERS
+        (
+            *(
+                Contrast(
+                    f"{kind} less plain",
+                    (f"walker/{kind}", "walker/plain"),
+                    (1, -1),
+                    "return by direction",
+                    "greater",
+                    50.0,
+                    "spread",
+                )
+                for kind in PAPER_REGULARISERS
+            ),
+            # The other reading, of one curve: how much it goes up and down. Added after the first seeds were seen.
+            *(
+                _greater(
+                    f"{kind} less plain, within a run",
+                    f"walker/{kind}",
+                    "walker/plain",
+                    "fluctuation",
+                    10.0,
+                    decides=False,
+                )
+                for kind in PAPER_REGULARISERS
+            ),
         ),
     ),
     Claim(
@@ -260,6 +290,20 @@ CLAIMS: tuple[Claim, ...] = (
                 "greater",
                 0.05,
             ),
+            Contrast(
+                "gap on AntMaze less gap on AntBandit, success",
+                (
+                    "maze/{schedule}/appropriate-bias",
+                    "maze/{schedule}/plain",
+                    "bandit/{schedule}/appropriate-bias",
+                    "bandit/{schedule}/plain",
+                ),
+                (1, -1, -1, 1),
+                "success",
+                "greater",
+                0.05,
+                decides=False,
+            ),
         ),
         everywhere=True,
     ),
@@ -293,26 +337,45 @@ CLAIMS: tuple[Claim, ...] = (
         13,
         "Stability penalties in the master's reward make no difference.",
         "8",
-        _both(
-            lambda place: tuple(
-                _same_way(
-                    f"{place}, {kind}", f"{place}/{{schedule}}-penalised/{kind}", f"{place}/{{schedule}}/{kind}", "same"
+        _shown_too(
+            _both(
+                lambda place: tuple(
+                    _same_way(
+                        f"{place}, {kind}",
+                        f"{place}/{{schedule}}-penalised/{kind}",
+                        f"{place}/{{schedule}}/{kind}",
+                        "same",
+                    )
+                    for kind in ("appropriate-bias", "plain")
                 )
-                for kind in ("appropriate-bias", "plain")
             )
         ),
     ),
     Claim(
         14,
-        "Interleaved sub-policies beat all three of the paper's, at handing over and under a master on AntMaze.",
+        "Interleaved sub-policies beat all three of the paper's, at handing over and under a master on AntMaze. "
+        "(They are annealed and end episodes on their backs besides; shown too: the paper's three, annealed.)",
         "ours",
         (
             *(
                 _greater(f"hand-overs, against {kind}", "walker/interleaved", f"walker/{kind}", "handover", 0.05)
                 for kind in PAPER_REGULARISERS
             ),
+            *_shown_too(
+                tuple(
+                    _way(f"maze, against {kind}", "maze/{schedule}/interleaved", f"maze/{{schedule}}/{kind}")
+                    for kind in PAPER_REGULARISERS
+                )
+            ),
             *(
-                _way(f"maze, against {kind}", "maze/{schedule}/interleaved", f"maze/{{schedule}}/{kind}")
+                _greater(
+                    f"hand-overs, against {kind}, annealed",
+                    "walker/interleaved",
+                    f"ablation/annealed/{kind}",
+                    "handover",
+                    0.05,
+                    decides=False,
+                )
                 for kind in PAPER_REGULARISERS
             ),
         ),
@@ -322,16 +385,18 @@ CLAIMS: tuple[Claim, ...] = (
         15,
         "One symmetric policy serves a master as well as four policies.",
         "ours",
-        _both(
-            lambda place: tuple(
-                _same_way(f"{place}, {one}", f"{place}/{{schedule}}/{one}", f"{place}/{{schedule}}/{four}", "not worse")
-                for one, four in (("symmetric", "plain"), ("symmetric-interleaved", "interleaved"))
+        _shown_too(
+            _both(
+                lambda place: tuple(
+                    _same_way(
+                        f"{place}, {one}", f"{place}/{{schedule}}/{one}", f"{place}/{{schedule}}/{four}", "not worse"
+                    )
+                    for one, four in (("symmetric", "plain"), ("symmetric-interleaved", "interleaved"))
+                )
             )
         ),
     ),
 )
-
-SCHEDULES = {"paper": "the paper's reward and schedule", "hrl": "our reward and schedule"}
 
 
 def settings_of(claim: Claim, prefixes: Iterable[str] = ("",)) -> list[Setting]:
@@ -357,7 +422,8 @@ def rows_read(prefixes: Iterable[str] = ("",)) -> list[str]:
         for row in c.rows
     }
     order = {name: i for i, name in enumerate(MAIN)}
-    return sorted(read, key=lambda name: (order.get(name, len(order)), name))
+    mine = (name for name in read if is_row(name) and not name.startswith("ablation/"))  # those have fewer seeds
+    return sorted(mine, key=lambda name: (order.get(name, len(order)), name))
 
 
 def prefixes_at_hand(results: Results) -> tuple[str, ...]:
@@ -379,7 +445,8 @@ def judge_all(results: Results) -> list[Judgement]:
 
 def judge(results: Results, claim: Claim, setting: Setting) -> Judgement:
     """A claim's verdict in a setting, from the files of its runs."""
-    findings = tuple(_find(results, claim, c, setting) for c in claim.contrasts)
+    contrasts = [c for c in claim.contrasts if c.decides or all(is_row(setting.fill(row)) for row in c.rows)]
+    findings = tuple(_find(results, claim, c, setting) for c in contrasts)
     deciding = [finding for finding in findings if finding.contrast.decides]
     verdict = _overall([finding.verdict for finding in deciding])
     return Judgement(claim, setting, _where(claim, setting), findings, verdict, _why(claim, deciding, verdict))
@@ -409,6 +476,8 @@ def _probability(what: Contrast, scores: list[Floats]) -> float | None:
     if len(scores) != 2:
         return None
     if what.statistic == "spread":  # that a run is farther from the middle of its row
+        if min(map(len, scores)) < 3:  # a lone one is its own middle
+            return None
         scores = [np.abs(score - np.median(score, axis=0)) for score in scores]
     return probability_of_improvement(*scores)
 
@@ -437,7 +506,9 @@ def _where(claim: Claim, setting: Setting) -> str:
 def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
     """One phrase that says what the verdict rests on, or what is missing."""
     if verdict != "undecided":
-        return f"{min(min(f.seeds) for f in deciding)} seeds or more on every side"
+        turned = [f.contrast.words for f in deciding if f.verdict == "does not hold" and is_reversed(f)]
+        said = f"; the other way round: {', '.join(turned)}" if turned else ""
+        return f"{seeds_in_words(min(min(f.seeds) for f in deciding))} or more on every side{said}"
     missing = [row for f in deciding for row, n in zip(f.rows, f.seeds, strict=True) if n == 0]
     if missing:
         return f"no runs of {', '.join(dict.fromkeys(missing))}"
@@ -446,6 +517,11 @@ def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
         so_far = _overall([f.so_far for f in deciding])
         return f"{seeds_in_words(fewest)}, {claim.min_seeds} are asked for; so far: {so_far}"
     return "the interval allows both"
+
+
+def is_reversed(finding: Finding) -> bool:
+    """Whether a difference that was to be positive is negative, and not only too small."""
+    return finding.contrast.rule in ("greater", "not worse") and finding.effect is not None and finding.effect.high < 0
 
 
 def show_effect(finding: Finding) -> str:
@@ -462,13 +538,13 @@ def show_effect(finding: Finding) -> str:
 __all__ = [
     "CLAIMS",
     "MIN_SEEDS",
-    "SCHEDULES",
     "Claim",
     "Contrast",
     "Finding",
     "Judgement",
     "Setting",
     "decide",
+    "is_reversed",
     "judge",
     "judge_all",
     "prefixes_at_hand",

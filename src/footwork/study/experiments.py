@@ -116,6 +116,9 @@ def _flat(task: Task, kind: str = "") -> list[Experiment]:
     ]
 
 
+# Two settings of a task. Flat policies keep Table 1's schedule with either reward.
+SCHEDULES = {"paper": "the paper's reward and schedule", "hrl": "our reward, our masters' schedule"}
+
 GUIDED_BANDIT = _guided(ANT_BANDIT)
 GUIDED_MAZE = replace(_guided(ANT_MAZE), potential="geodesic")
 
@@ -188,15 +191,48 @@ GRIDS: tuple[Grid, ...] = (
     Grid("ablation/bandit/k", "bandit/hrl/interleaved", "option_steps", (10, 20, 100, 200, 400), "k (control steps)"),
     Grid("ablation/maze/k", "maze/hrl/interleaved", "option_steps", (10, 20, 100, 200, 400), "k (control steps)"),
     Grid("ablation/maze/k-paper", "maze/paper/interleaved", "option_steps", (100, 200, 400), "k (control steps)"),
-    Grid("ablation/random-start/t", "walker/random-start", "regulariser.steps", (10, 25, 100, 200), "t"),
-    Grid("ablation/random-repeated/t", "walker/random-repeated", "regulariser.every", (25, 50, 200, 400), "t"),
-    Grid("ablation/appropriate-bias/t", "walker/appropriate-bias", "regulariser.steps", (25, 50, 200, 400), "t"),
-    Grid("ablation/interleaved/t", "walker/interleaved", "regulariser.mean_steps", (16, 80, 160, 320), "mean stay"),
+    Grid(
+        "ablation/random-start/t", "walker/random-start", "regulariser.steps", (10, 25, 100, 200), "t (control steps)"
+    ),
+    Grid(
+        "ablation/random-repeated/t",
+        "walker/random-repeated",
+        "regulariser.every",
+        (25, 50, 200, 400),
+        "t (control steps)",
+    ),
+    Grid(
+        "ablation/appropriate-bias/t",
+        "walker/appropriate-bias",
+        "regulariser.steps",
+        (25, 50, 200, 400),
+        "t (control steps)",
+    ),
+    Grid(
+        "ablation/interleaved/t",
+        "walker/interleaved",
+        "regulariser.mean_steps",
+        (16, 80, 160, 320),
+        "mean stay (control steps)",
+    ),
     Grid("ablation/walker/B-as-size", "walker/plain", "ppo.minibatch_size", (32,), "B as a size"),
     Grid("ablation/bandit/B-as-size", "bandit/paper/interleaved", "ppo.minibatch_size", (32,), "B as a size"),
     Grid("ablation/maze/B-as-size", "maze/paper/interleaved", "ppo.minibatch_size", (32,), "B as a size"),
     Grid("ablation/maze/potential", "maze/hrl/interleaved", "task.potential", ("straight",), "potential"),
     Grid("ablation/maze/potential-paper", "maze/paper/interleaved", "task.potential", ("geodesic",), "potential"),
+)
+
+# What interleaved rows have besides their regulariser: annealing. The paper's rows with it, to tell the two apart.
+ANNEALED: tuple[Experiment, ...] = tuple(
+    replace(
+        row,
+        name=f"ablation/annealed/{row.name.removeprefix('walker/')}",
+        ppo=_annealed(row.total_steps),
+        regulariser=AppropriateBias(partners="ablation/annealed/plain")
+        if isinstance(row.regulariser, AppropriateBias)
+        else row.regulariser,
+    )
+    for row in WALKERS[:4]
 )
 
 # Rows of the light ant: what claims 7 to 12 and 14 read.
@@ -234,6 +270,7 @@ def with_robot(experiment: Experiment, robot: Robot) -> Experiment:
 EXPERIMENTS: dict[str, Experiment] = {
     **MAIN,
     **{row.name: row for grid in GRIDS for row in grid.rows()},
+    **{row.name: row for row in ANNEALED},
     **{row.name: row for row in (_of_robot(MAIN[name], ROBOTS["light"]) for name in LIGHT)},
 }
 

@@ -8,8 +8,10 @@ is there twice) is named in :attr:`Results.problems`; nothing is skipped in sile
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,12 +19,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from footwork.arena import DIRECTIONS
+from footwork.arena import DIRECTIONS, Arena, DistanceField, Point, geodesic_field
 from footwork.checkpoint import CheckpointError, write_atomically
 from footwork.record import RunDir, RunError, config_from_json, read_metrics
 from footwork.statistics import Floats
 from footwork.study.experiments import is_row
-from footwork.study.measure import EVALUATION, TRANSITIONS, problem_with
+from footwork.study.measure import EVALUATION, TRANSITIONS, problem_with, straight_line_stop
 from footwork.study.plan import Study
 from footwork.train import Experiment, planned_steps, steps_per_iteration
 
@@ -410,6 +412,45 @@ def _handover(results: Results, sample: Sample) -> float | None:
     return float(np.mean([entry["handover"][i][j]["success"] for i, j in pairs]))
 
 
+def _fluctuation(results: Results, sample: Sample) -> Any:
+    """Of each direction's training return about its own course, in the second half of training [R].
+
+    Half the mean square of the differences between neighbouring bins is their variance, wherever the course goes
+    (von Neumann 1941).
+    """
+    curve = results.whole_curve(sample)
+    if curve is None:
+        return None
+    returns = _of_seed(curve, sample).values["return"]
+    with warnings.catch_warnings():  # a direction of which no episode ended in two bins on end
+        warnings.simplefilter("ignore", RuntimeWarning)
+        found = np.sqrt(np.nanmean(np.diff(returns[len(returns) // 2 :], axis=0) ** 2, axis=0) / 2)
+    return None if np.isnan(found).any() else found
+
+
+@functools.cache
+def _way_around(arena: Arena) -> DistanceField:
+    return geodesic_field(arena)
+
+
+def _route(results: Results, sample: Sample) -> float | None:
+    """As ``way``, along the shortest way around the walls: on AntMaze a straight line leads into one."""
+    arena, entry = sample.experiment.task.arena, results.entry(sample, EVALUATION)
+    if entry is None or len(arena.goals) != 1:
+        return None
+    field = _way_around(arena)
+    left = np.mean(field.at(np.array(entry["ends"], np.float64)))
+    return float(1.0 - left / field.at(np.array(arena.start)))
+
+
+def _ended_within(radius: float, place: Callable[[Arena], Point | None], results: Results, sample: Sample) -> Any:
+    """Share of the episodes that ended so near to a place."""
+    entry, where = results.entry(sample, EVALUATION), place(sample.experiment.task.arena)
+    if entry is None or where is None:
+        return None
+    return float(np.mean(np.hypot(*(np.array(entry["ends"], np.float64) - np.array(where)).T) <= radius))
+
+
 def seeds_in_words(count: int | str) -> str:
     """``1 seed``, ``2 seeds``, ``3 / 10 seeds``."""
     return f"{count} seed{'' if str(count) == '1' else 's'}"
@@ -421,6 +462,14 @@ METRICS: dict[str, Metric] = {
     "stuck": Metric(
         "episodes that end where the straight line meets the wall", lambda r, s: _evaluated("stuck", r, s), True
     ),
+    "stuck close": Metric(
+        "episodes that end within 0.5 m of there", lambda r, s: _ended_within(0.5, straight_line_stop, r, s), True
+    ),
+    "at the start": Metric(
+        "episodes that end within 0.5 m of the start", lambda r, s: _ended_within(0.5, lambda a: a.start, r, s), True
+    ),
+    "route": Metric("share of the shortest way around the walls", _route, True),
+    "fluctuation": Metric("training return's deviation from one hundredth of training to the next", _fluctuation),
     "return": Metric("training return per episode, last tenth of training", _mean_final_return),
     "return by direction": Metric("training return per episode and direction, last tenth of training", _final_return),
     "handover": Metric("orthogonal hand-overs that succeed", _handover, True),

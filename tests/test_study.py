@@ -17,7 +17,7 @@ from footwork.record import RunDir, RunError, read_metrics
 from footwork.statistics import Effect, iqm
 from footwork.study import answers, claims, measure, plan, report, results
 from footwork.study.experiments import EXPERIMENTS, GRIDS, MAIN, find_row, match_rows
-from footwork.study.figures import FIGURES, draw_figures, find_figures
+from footwork.study.figures import FIGURES, draw_figures, find_figures, style
 from footwork.study.plan import FULL, QUICK, Study
 
 WALKERS = ("walker/plain", "walker/random-start", "walker/random-repeated", "walker/appropriate-bias")
@@ -484,7 +484,13 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
     text, page = (path.read_text() for path in pages)
     for words in (
         "## Claims",
+        "### Each claim in each setting",
         "## The paper, in its order",
+        "### What the paper leaves open, and what we took",
+        "entropy bonus 0.02",
+        "walker/plain 2 of 10, walker/random-start 3 of 10",
+        "ablation/maze/k/10, ",  # rows that nobody has run are named
+        "light/walker/plain, ",
         "## Figures",
         "## Rows",
         "seed-2 is not finished",
@@ -502,6 +508,19 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
         assert (one.verdict, one.why) == (other.verdict, other.why)
         for a, b in zip(one.findings, other.findings, strict=True):
             assert a.effect is b.effect is None or a.effect == pytest.approx(b.effect, rel=1e-3)
+
+
+def test_figures_of_which_there_is_one_are_not_drawn_under_another_ant(study, tmp_path):
+    fill(study, ("light/walker/plain", "light/maze/hrl/interleaved"), 1)
+    drawn = draw_figures(results.Results(study), find_figures(["12", "13", "14", "20"]), tmp_path, "light/")
+    assert [one.figure.name for one in drawn] == ["12-switching"]
+
+
+def test_legends_say_how_many_seeds(study):
+    fill(study, ("maze/paper/plain",), 2)
+    fill(study, ("maze/hrl/plain",), 1)
+    rows = ("maze/paper/plain", "maze/hrl/plain", "maze/flat/free")
+    assert style.labels_of(results.Results(study), rows) == dict.fromkeys(rows[:2], "plain (n = 2, 1)")
 
 
 def test_answers_name_claims_and_figures_that_exist():

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from footwork.statistics import iqm
 from footwork.study.claims import Judgement, show_effect
-from footwork.study.experiments import GRIDS, is_row
+from footwork.study.experiments import GRIDS, find_row, is_row
 from footwork.study.results import METRICS, Results, seeds_in_words
 
 
@@ -67,11 +68,15 @@ _LENGTHS = tuple(f"ablation/{kind}/t" for kind in ("random-start", "random-repea
 
 ANSWERS: tuple[Answer, ...] = (
     Answer(
-        "1",
-        "Without resetting joints, the hierarchy is able to navigate to a given goal",
+        "abstract, 1",
+        "Without resetting joints, the hierarchy navigates to a given goal; the flat policies fail",
         figures=(15, 16),
         shows=tuple(
-            _rows("success", *(f"{place}/{kind}" for kind in ("paper/appropriate-bias", "hrl/appropriate-bias")))
+            _rows(
+                "success",
+                *(f"{place}/{row}" for row in ("paper/appropriate-bias", "hrl/appropriate-bias", "hrl/interleaved")),
+                *(f"{place}/flat/{row}" for row in ("penalised", "free", "guided-penalised", "guided-free")),
+            )
             for place in ("bandit", "maze")
         ),
         built="no joint is reset but at the start of an episode",
@@ -80,7 +85,8 @@ ANSWERS: tuple[Answer, ...] = (
         "3.1",
         "AntWalker: four directions, targets 10 km away; 32 observations, 8 torques (Figure 1)",
         figures=(1,),
-        built="as described",
+        built="as described; the reward is progress, staying alive, and four penalties: power, stalling torque, joints "
+        "at their limits, colliding feet, weighted as PyBullet's own ants are",
     ),
     Answer(
         "3.2",
@@ -92,7 +98,7 @@ ANSWERS: tuple[Answer, ...] = (
         "3.3",
         "AntMaze: a fixed point in a maze; 34 observations (Figure 3)",
         figures=(3,),
-        built="as described; the walls' places are read off the figure",
+        built="as described; the maze itself is not stated: ours is the U of the field's benchmarks, cells of 4 m",
     ),
     Answer(
         "3.4",
@@ -104,6 +110,7 @@ ANSWERS: tuple[Answer, ...] = (
         ),
         built="walker/... is the heavy ant on MuJoCo; light/... MuJoCo's own; bullet/... the heavy one on PyBullet",
     ),
+    Answer("3.4", "A bug draws the walls at half their size", figures=(3,), built="not copied: drawn as they are"),
     Answer(
         "4", "Every k steps the master decides which policy runs next (Figure 4)", figures=(4,), built="as described"
     ),
@@ -138,17 +145,120 @@ ANSWERS: tuple[Answer, ...] = (
         ),
         built="a number; 32 as a size is an ablation",
     ),
-    Answer("8", "Stability penalties while training the master do not make a difference", (13,)),
+    Answer(
+        "7",
+        "The reward is averaged over consecutive runs to get a cleaner plot",
+        figures=(5, 6, 9, 10),
+        built="so here",
+    ),
+    Answer("8", "Stability penalties while training the master do not make a difference", (13,), (20,)),
     Answer("8", "The regularised hierarchy outperforms the flat policies (Figures 5, 6)", (1, 2), (5, 6, 15, 18)),
+    Answer(
+        "8",
+        "This is a fair comparison: the observations are enough for an ideal algorithm",
+        figures=(5, 6),
+        built="flat policies see what masters see and take 10 M control steps; a master takes 0.5 or 2 M on "
+        "sub-policies of 4 to 8 M. With the masters' reward (flat/guided-...) they are shown too",
+    ),
     Answer("8", "Flat policies without stability penalties perform better than with them", (3,), (5, 6)),
     Answer("8", "Unregularised sub-policies show a considerably smaller variance (Figures 7, 8)", (6,), (7, 8)),
     Answer("8", "Unregularised policies achieve higher rewards eventually", (5,), (7, 8)),
     Answer("8", "... but do not allow smooth transitions", (12,), (11, 12)),
     Answer("8", "Regularised sub-policies serve as much better slaves (Figures 9, 10)", (7, 8), (9, 10, 16)),
     Answer("8", "The difference is much more pronounced on AntMaze", (9,), (9, 10)),
+    Answer(
+        "8",
+        "AntBandit requires only one transition in the ideal case, AntMaze several",
+        figures=(16,),
+        shows=tuple(
+            _rows("transitions", *(f"{place}/hrl/{kind}" for kind in ("plain", "appropriate-bias", "interleaved")))
+            for place in ("bandit", "maze")
+        ),
+    ),
     Answer("9", "Moving straight to the target, the flat policy gets stuck in a wall", (4,), (16, 17)),
     Answer("ours", "Interleaved sub-policies; one symmetric policy", (14, 15), (11, 12)),
 )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Something that the paper leaves open, and what was taken."""
+
+    what: str
+    here: str
+
+
+def _choices() -> tuple[Choice, ...]:
+    """Read off the rows themselves."""
+
+    def fields(kind: str) -> dict[str, Any]:
+        return vars(find_row(f"walker/{kind}").regulariser)
+
+    walker, annealed = find_row("walker/plain"), find_row("walker/interleaved").ppo
+    maze, bandit = find_row("maze/paper/plain"), find_row("bandit/paper/plain")
+    ours, flat = find_row("maze/hrl/plain"), find_row("maze/flat/free")
+    table_1, masters = walker.ppo, ours.ppo
+    weights = walker.task.weights
+    corner, start = bandit.task.arena.goals[0], maze.task.arena.start
+    return (
+        Choice("engine and ant", "MuJoCo, the ant with the masses of PyBullet's; docs/ant.md compares them"),
+        Choice(
+            "control steps",
+            f"sub-policies {walker.total_steps:,} per direction (symmetric ones "
+            f"{find_row('walker/symmetric').total_steps:,}), masters {bandit.total_steps:,} on AntBandit and "
+            f"{maze.total_steps:,} on AntMaze, flat policies {flat.total_steps:,}",
+        ),
+        Choice(
+            "episodes",
+            f"{walker.task.episode_steps} control steps in training sub-policies, {maze.task.episode_steps} on the "
+            "tasks; a sub-policy's ends when the torso is too low, a task's within "
+            f"{maze.task.goal_radius} m of the goal",
+        ),
+        Choice(
+            "PPO beside Table 1",
+            f"entropy bonus {table_1.ent_coef} (without it half of the walkers never leave their stand), advantages "
+            f"normalised per update, Adam's epsilon {table_1.adam_eps:g}, log-deviation {table_1.initial_log_std:g} at "
+            "first; no schedule of the learning rate, no gradient clipping",
+        ),
+        Choice(
+            "S = 2048",
+            f"{table_1.num_envs} ants side by side, {table_1.num_steps} control steps each per update; S = 128 and 40 "
+            f"of the masters: {maze.ppo.num_envs} ants, {maze.ppo.num_steps} and {bandit.ppo.num_steps} decisions each",
+        ),
+        Choice(
+            "reward weights",
+            f"progress {weights.progress:g} (m/s), alive {weights.alive:g}, power {weights.electricity:g}, stalling "
+            f"torque {weights.stall_torque:g}, joints at limits {weights.joints_at_limit:g}, feet "
+            f"{weights.feet_collision:g}; nothing for being alive on the tasks",
+        ),
+        Choice("k", f"{maze.option_steps} control steps"),
+        Choice(
+            "t",
+            f"random start {fields('random-start')['steps']} control steps; random repeated "
+            f"{fields('random-repeated')['duration']} steps of noise every {fields('random-repeated')['every']}; "
+            f"appropriate bias {fields('appropriate-bias')['steps']} steps of a partner from walker/plain",
+        ),
+        Choice(
+            "square and maze", f"corners {corner[0]:g} m from the middle along x and y; start of the U maze at {start}"
+        ),
+        Choice(
+            "our reward, our masters' schedule (rows hrl and guided)",
+            f"{ours.task.weights.goal:g} for arriving, coordinates times {ours.task.xy_scale:g}, on AntMaze progress "
+            f"along the shortest way around the walls; masters: {masters.num_envs} ants, {masters.num_steps} decisions "
+            f"each, {masters.num_minibatches} batches, learning rate {masters.learning_rate:g}, rewards times "
+            f"{masters.reward_scale:g}. Flat policies keep Table 1's schedule with either reward",
+        ),
+        Choice(
+            "interleaved rows",
+            f"stays of {fields('interleaved')['mean_steps']} control steps in the mean, an exchange at every "
+            f"{fields('interleaved')['every']}th step at most; entropy bonus and learning rate fall over the training "
+            f"to {annealed.final_ent_coef_share:g} and {annealed.final_learning_rate_share:g} of what they are; "
+            "episodes end on the back too",
+        ),
+    )
+
+
+CHOICES: tuple[Choice, ...] = _choices()
 
 
 def said(answer: Answer, judgements: Sequence[Judgement], results: Results) -> str:
@@ -182,4 +292,4 @@ def _side_by_side(shown: Shown, results: Results) -> str:
     return f"{grid}{metric.words}: {'; '.join(parts)}"
 
 
-__all__ = ["ANSWERS", "Answer", "Shown", "said"]
+__all__ = ["ANSWERS", "CHOICES", "Answer", "Choice", "Shown", "said"]

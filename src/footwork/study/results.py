@@ -451,6 +451,14 @@ def _ended_within(radius: float, place: Callable[[Arena], Point | None], results
     return float(np.mean(np.hypot(*(np.array(entry["ends"], np.float64) - np.array(where)).T) <= radius))
 
 
+def _transitions(results: Results, sample: Sample) -> float | None:
+    """How often a master changes from one sub-policy to another in an episode, mean over those whose paths are kept."""
+    entry = results.entry(sample, EVALUATION)
+    if entry is None or not sample.experiment.is_master:
+        return None
+    return float(np.mean([np.count_nonzero(np.diff(path["choices"])) for path in entry["paths"]]))
+
+
 def seeds_in_words(count: int | str) -> str:
     """``1 seed``, ``2 seeds``, ``3 / 10 seeds``."""
     return f"{count} seed{'' if str(count) == '1' else 's'}"
@@ -473,6 +481,7 @@ METRICS: dict[str, Metric] = {
     "return": Metric("training return per episode, last tenth of training", _mean_final_return),
     "return by direction": Metric("training return per episode and direction, last tenth of training", _final_return),
     "handover": Metric("orthogonal hand-overs that succeed", _handover, True),
+    "transitions": Metric("changes of sub-policy per episode", _transitions),
     "speed": Metric("speed along the direction (m/s)", _speed),
 }
 

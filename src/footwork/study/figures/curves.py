@@ -11,13 +11,17 @@ from matplotlib.ticker import MaxNLocator
 from footwork.arena import DIRECTIONS, shortest_path
 from footwork.palette import DIRECTION_COLOURS
 from footwork.statistics import DRAWS, Floats, curve_band, generator_for
-from footwork.study.figures.style import empty, label_of, legend_below, look_of, panels
+from footwork.study.experiments import SCHEDULES, find_row
+from footwork.study.figures.style import count_in_words, empty, labels_of, legend_below, log_axis, look_of, panels
 from footwork.study.results import Curve, Results, Sample, seeds_in_words
 from footwork.train import Experiment
 
 _POINTS = 100
+_SMOOTH = 20  # curves of tasks are averaged over the last twentieth of the training each time
+_FIRST = 20_000  # control steps, where logarithmic axes begin
+_STEPS = (3e4, 1e5, 3e5, 1e6, 3e6, 1e7)
+_MINUTES = (0.03, 0.1, 0.3, 1, 3, 10)
 Value = Callable[[Sample, Curve], Floats]  # of a seed's curve, [X]
-SCHEDULE_TITLES = {"paper": "the paper's reward and schedule", "hrl": "our reward and schedule"}
 
 
 def way_at_start(experiment: Experiment) -> float:
@@ -31,33 +35,41 @@ def way_at_start(experiment: Experiment) -> float:
 
 def share_of_way(sample: Sample, curve: Curve) -> Floats:
     """The distance part of the reward, in the row's own potential, as a share of what the whole way pays."""
-    metres = curve.values["progress"][:, 0] * sample.experiment.task.robot.control_dt
+    metres = _smooth(curve, "progress") * sample.experiment.task.robot.control_dt
     return np.asarray(metres / way_at_start(sample.experiment))
 
 
 def success(sample: Sample, curve: Curve) -> Floats:
-    """Share of the training episodes that ended in the goal, over the last twentieth of the training each time."""
+    """Share of the training episodes that ended in the goal."""
+    return _smooth(curve, "success")
+
+
+def _smooth(curve: Curve, name: str) -> Floats:
+    """Mean over the episodes of the last twentieth of the training, each time."""
     episodes = curve.episodes[:, 0]
-    hits = np.nan_to_num(curve.values["success"][:, 0]) * episodes
-    window = np.ones(max(1, len(episodes) // 20))
+    total = np.nan_to_num(curve.values[name][:, 0]) * episodes
+    window = np.ones(max(1, len(episodes) // _SMOOTH))
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.convolve(hits, window)[: len(hits)] / np.convolve(episodes, window)[: len(hits)])
+        return np.asarray(np.convolve(total, window)[: len(total)] / np.convolve(episodes, window)[: len(total)])
 
 
-def on_common_grid(xs: list[Floats], ys: list[Floats]) -> tuple[Floats, Floats] | None:
+def on_common_grid(xs: list[Floats], ys: list[Floats], log: bool = False) -> tuple[Floats, Floats] | None:
     """Curves of several seeds at the same points: x [X] and y [S, X]; None where nothing is finite."""
-    pairs = [(x[np.isfinite(y)], y[np.isfinite(y)]) for x, y in zip(xs, ys, strict=True)]
+    kept = [np.isfinite(y) & (x > 0 if log else True) for x, y in zip(xs, ys, strict=True)]
+    pairs = [(x[k], y[k]) for x, y, k in zip(xs, ys, kept, strict=True)]
     pairs = [(x, y) for x, y in pairs if x.size]
     if not pairs:
         return None
     low, high = max(x[0] for x, _ in pairs), min(x[-1] for x, _ in pairs)
-    grid = np.linspace(min(low, high), high, _POINTS)
+    grid = np.geomspace(min(low, high), high, _POINTS) if log else np.linspace(min(low, high), high, _POINTS)
     return grid, np.stack([np.interp(grid, x, y) for x, y in pairs])
 
 
-def draw_curve(ax: Any, xs: list[Floats], ys: list[Floats], name: str, colour: str, line: Any, label: str) -> bool:
-    """IQM over seeds with its 95 % band; whether there was anything to draw."""
-    found = on_common_grid(xs, ys)
+def draw_curve(
+    ax: Any, xs: list[Floats], ys: list[Floats], name: str, colour: str, line: Any, label: str, log: bool = False
+) -> bool:
+    """IQM over seeds with its pointwise 95 % band; whether there was anything to draw."""
+    found = on_common_grid(xs, ys, log)
     if found is None:
         return False
     x, y = found
@@ -68,37 +80,69 @@ def draw_curve(ax: Any, xs: list[Floats], ys: list[Floats], name: str, colour: s
     return True
 
 
-def draw_row(ax: Any, results: Results, row: str, value: Value, x: str = "step") -> bool:
-    """A row's curve against control steps or seconds."""
+def draw_row(
+    ax: Any, results: Results, row: str, value: Value, label: str, x: str = "step", log: bool = False, line: Any = None
+) -> bool:
+    """A row's curve against control steps or minutes."""
     curves = results.curves(row)
     if not curves:
         return False
     look = look_of(row)
     xs = [curve.step if x == "step" else curve.seconds / 60 for _, curve in curves]
     ys = [value(sample, curve) for sample, curve in curves]
-    label = f"{label_of(row)}"
-    return draw_curve(ax, xs, ys, f"{row} {x} {value.__name__}", look.colour, look.line, label)
+    name = f"{row} {x} {value.__name__}"
+    return draw_curve(ax, xs, ys, name, look.colour, look.line if line is None else line, label, log)
 
 
 def task_curves(results: Results, rows: tuple[str, ...]) -> Any:
     """Masters (and flat policies) of one task, with the paper's reward and schedule and with ours."""
-    kinds = {"paper": [r for r in rows if not _ours(r)], "hrl": [r for r in rows if _ours(r)]}
-    figure, axes = panels(1, 2, 3.5, share_y=True)
+    kinds = {"paper": [r for r in rows if not _guided(r)], "hrl": [r for r in rows if _guided(r)]}
+    log = any(find_row(row).total_steps > 4 * find_row(rows[0]).total_steps for row in rows)
+    figure, axes = panels(1, 2, 3.6, share_y=True)
+    labels = labels_of(results, rows)
     for ax, (schedule, mine) in zip(axes[0], kinds.items(), strict=True):
-        drawn = [draw_row(ax, results, row, share_of_way) for row in mine]
-        ax.set_title(SCHEDULE_TITLES[schedule])
+        drawn = [draw_row(ax, results, row, share_of_way, labels.get(row, ""), log=log) for row in mine]
+        straight = all(find_row(row).task.potential == "straight" for row in mine)
+        ax.set_title(
+            f"{SCHEDULES[schedule]};\nprogress {'along the straight line' if straight else 'around the walls'}"
+        )
         ax.axhline(1.0, color="#999999", lw=0.8, ls=":")
-        ax.set_xlabel("control steps")
-        _plain_steps(ax)
+        ax.set_xlabel("control steps" + (" (logarithmic)" if log else ""))
+        if log:
+            log_axis(ax, _STEPS, count_in_words, _FIRST, max(_STEPS))
+        else:
+            _plain_steps(ax)
         if not any(drawn):
-            empty(ax, "no finished runs yet")
+            empty(ax, "no finished runs yet" if mine else "no such rows")
     axes[0, 0].set_ylabel("distance part of the reward\n(share of the whole way; 1: at the goal)")
     legend_below(figure, axes[0])
     return figure
 
 
-def _ours(row: str) -> bool:
-    return "/hrl" in row or "guided" in row
+def _guided(row: str) -> bool:
+    """Whether arriving pays: our reward."""
+    return find_row(row).task.weights.goal > 0
+
+
+def penalty_curves(results: Results, rows: tuple[str, ...]) -> Any:
+    """Masters with and without stability penalties in their reward, on both tasks."""
+    figure, axes = panels(2, 2, 2.8, share_y=True)
+    labels = labels_of(results, rows, _with_or_without)
+    for line, place in zip(axes, ("bandit", "maze"), strict=True):
+        for ax, schedule in zip(line, SCHEDULES, strict=True):
+            drawn = []
+            for row in rows:
+                if row.startswith((f"{place}/{schedule}/", f"{place}/{schedule}-penalised/")):
+                    dashes = (0, (1, 1.5)) if _penalised(row) else "-"
+                    drawn.append(draw_row(ax, results, row, share_of_way, labels.get(row, ""), line=dashes))
+            ax.set_title(f"Ant{place.capitalize()}: {SCHEDULES[schedule]}")
+            ax.set_xlabel("control steps")
+            _plain_steps(ax)
+            if not any(drawn):
+                empty(ax, "no finished runs yet")
+        line[0].set_ylabel("distance part of the reward")
+    legend_below(figure, list(axes.flat), columns=2)
+    return figure
 
 
 def direction_curves(results: Results, rows: tuple[str, ...]) -> Any:
@@ -124,15 +168,28 @@ def direction_curves(results: Results, rows: tuple[str, ...]) -> Any:
     return figure
 
 
+def _penalised(row: str) -> bool:
+    return find_row(row).task.weights.electricity < 0
+
+
+def _with_or_without(row: str) -> str:
+    return f"{row.rpartition('/')[2]}, {'with penalties' if _penalised(row) else 'without'}"
+
+
 def success_curves(results: Results, rows: tuple[str, ...]) -> Any:
     """Share of training episodes that end in the goal, against control steps and against wall time."""
     figure, axes = panels(2, 2, 2.7, share_y=True)
+    labels = labels_of(results, rows)
     for line, place in zip(axes, ("bandit", "maze"), strict=True):
         for ax, x in zip(line, ("step", "minutes"), strict=True):
-            drawn = [draw_row(ax, results, row, success, x) for row in rows if f"/{place}/" in f"/{row}"]
-            ax.set_xscale("symlog", linthresh=20_000 if x == "step" else 0.2)
+            mine = [row for row in rows if f"/{place}/" in f"/{row}"]
+            drawn = [draw_row(ax, results, row, success, labels.get(row, ""), x, log=True) for row in mine]
+            if x == "step":
+                log_axis(ax, _STEPS, count_in_words, _FIRST, max(_STEPS))
+            else:
+                log_axis(ax, _MINUTES, lambda minutes: f"{minutes:g}", min(_MINUTES), max(_MINUTES))
             ax.set_title(f"Ant{place.capitalize()}")
-            ax.set_xlabel("control steps" if x == "step" else "minutes of training")
+            ax.set_xlabel("control steps (logarithmic)" if x == "step" else "minutes of training (logarithmic)")
             ax.set_ylim(-0.03, 1.03)
             if not any(drawn):
                 empty(ax, "no finished runs yet")
@@ -143,5 +200,5 @@ def success_curves(results: Results, rows: tuple[str, ...]) -> Any:
 
 def _plain_steps(ax: Any) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(5))
-    ax.xaxis.set_major_formatter(lambda x, _: f"{x / 1e6:g} M" if x else "0")
+    ax.xaxis.set_major_formatter(lambda x, _: count_in_words(x) if x else "0")
     ax.set_xlim(left=0)

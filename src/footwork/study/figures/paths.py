@@ -136,7 +136,11 @@ def maze_paths(results: Results, rows: tuple[str, ...]) -> Any:
             ax.add_collection(LineCollection(list(segments), colors=colours, linewidths=1.1, alpha=0.8))
         _draw_arena(ax, find_row(row).task.arena, None)
         _crop(ax, find_row(row).task.arena)
-        words = "no finished runs yet" if entry is None else f"{100 * entry['success']['1.0']:.0f} % within 1 m"
+        words = (
+            "no finished runs yet"
+            if entry is None
+            else f"seed {entry['seed']}: {100 * entry['success']['1.0']:.0f} % within 1 m"
+        )
         ax.set_title(f"{row}\n{words}", fontsize=8)
     for ax in axes.flat[len(rows) :]:
         ax.axis("off")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +13,8 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+
+from footwork.study.results import Results
 
 DPI = 160
 WIDTH = 7.2  # inches, of a page
@@ -48,9 +50,9 @@ LOOKS: dict[str, Look] = {
     "symmetric": Look("#CC79A7", (0, (1, 1)), "P"),
     "symmetric-interleaved": Look("#D55E00", (0, (4, 1, 1, 1, 1, 1)), "X"),
     "free": Look("#7A7A7A", (0, (2, 2)), "<"),
-    "penalised": Look("#7A7A7A", (0, (1, 3)), ">"),
+    "penalised": Look("#332288", (0, (4, 1, 1, 1)), ">"),
     "guided-free": Look("#A6761D", (0, (2, 2)), "<"),
-    "guided-penalised": Look("#A6761D", (0, (1, 3)), ">"),
+    "guided-penalised": Look("#882255", (0, (4, 1, 1, 1)), ">"),
 }
 _OTHER = Look("#444444", "-", ".")
 
@@ -64,6 +66,28 @@ def label_of(row: str) -> str:
     """What a row is called in a legend."""
     last = row.rpartition("/")[2]
     return f"flat, {last}" if "/flat/" in row else last
+
+
+def labels_of(results: Results, rows: Iterable[str], named: Callable[[str], str] = label_of) -> dict[str, str]:
+    """What each row with runs is called in a legend, with its seeds: every number of them where rows share a name."""
+    seeds = {row: count for row in rows if (count := len(results.samples(row)))}
+    together: dict[str, list[int]] = {}
+    for row, count in seeds.items():
+        together.setdefault(named(row), []).append(count)
+    return {row: f"{named(row)} (n = {', '.join(map(str, dict.fromkeys(together[named(row)])))})" for row in seeds}
+
+
+def log_axis(ax: Any, ticks: Sequence[float], words: Callable[[float], str], low: float, high: float) -> None:
+    """A logarithmic x axis with ticks that are read as numbers."""
+    ax.set_xscale("log")
+    ax.set_xticks(list(ticks), [words(tick) for tick in ticks])
+    ax.minorticks_off()
+    ax.set_xlim(low, high)
+
+
+def count_in_words(steps: float) -> str:
+    """``30 k``, ``3 M``."""
+    return f"{steps / 1e6:g} M" if steps >= 1e6 else f"{steps / 1e3:g} k"
 
 
 @contextmanager
@@ -93,7 +117,7 @@ def save(figure: Any, path: Path, note: str = "") -> list[Path]:
     return [png, svg]
 
 
-def legend_below(figure: Any, axes: Sequence[Any], columns: int = 4) -> None:
+def legend_below(figure: Any, axes: Sequence[Any], columns: int = 3) -> None:
     """One legend for several axes, each label once."""
     handles: dict[str, Any] = {}
     for ax in axes:

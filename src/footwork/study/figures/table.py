@@ -28,7 +28,7 @@ class Figure:
         draw: from the results and the rows, a matplotlib figure.
         rows: that it reads.
         paper: the figure of the paper that it answers, if any.
-        compares_ants: it sets ants beside each other, so that there is one of it and not one for each.
+        once: there is one of it, and not one per engine and ant: it sets them side by side, or is about the default.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Figure:
     draw: Callable[[Results, tuple[str, ...]], Any]
     rows: tuple[str, ...] = ()
     paper: str = ""
-    compares_ants: bool = False
+    once: bool = False
 
 
 class Drawn(NamedTuple):
@@ -66,14 +66,19 @@ def _walkers(kinds: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"walker/{kind}" for kind in kinds)
 
 
-_BANDS = "Interquartile mean over seeds, 95 % stratified-bootstrap bands."
-_REWARD = f"Only the distance part of the reward, as the paper plots; in shares of the whole way. {_BANDS}"
+_BANDS = "Interquartile mean over seeds, pointwise 95 % bootstrap bands; n is the number of seeds."
+_REWARD = (
+    "Only the distance part of the reward, as the paper plots, in shares of the whole way and averaged over the last "
+    "twentieth of the training each time. Left along the straight line; right, on AntMaze, along the shortest way "
+    "around the walls, so that the two panels differ in what is measured. An episode that ends in the goal circle does "
+    f"not quite reach 1. Sub-policies' own training (4 to 8 M control steps) is not on the axis. {_BANDS}"
+)
 
 FIGURES: tuple[Figure, ...] = (
     Figure(
         "01-walker",
         "AntWalker",
-        "One direction is walked in; the orb only shows which. The target is 10 km away.",
+        "The arena without walls in which sub-policies learn. The target is 10 km away in one of four directions.",
         scenes.walker_scene,
         paper="Figure 1",
     ),
@@ -87,7 +92,7 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "03-maze",
         "AntMaze",
-        "The straight line to the goal (dotted) leads into a wall. Walls are drawn lower than they are.",
+        "The straight line to the goal leads into a wall.",
         scenes.maze_scene,
         paper="Figure 3",
     ),
@@ -149,7 +154,8 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "11-handovers",
         "Hand-overs: from each direction to each",
-        "Upper number: per cent of hand-overs without fall or flip, at 0.5 m/s or more; lower: mean speed after (m/s).",
+        "Upper number: per cent of hand-overs without fall or flip, at 0.5 m/s or more; lower: mean speed after (m/s). "
+        "Means over seeds, 32 ants per pair and seed.",
         measures.handover_maps,
         _walkers(_ALL_KINDS),
     ),
@@ -163,19 +169,26 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "13-option-length",
         "The length k of an option",
-        "IQM over seeds with 95 % intervals, masters on interleaved sub-policies.",
+        "IQM over seeds with 95 % intervals, masters on interleaved sub-policies. Control steps and decisions per "
+        "update are the same everywhere, so that a longer option leaves a master fewer updates (on AntMaze 781 at "
+        "k = 10, 19 at k = 400).",
         measures.k_grids,
+        measures.rows_of_grids("k"),
+        once=True,
     ),
     Figure(
         "14-regulariser-length",
         "The length t of each regulariser",
         "IQM over seeds with 95 % intervals. Hand-overs between orthogonal directions; speed without hand-overs.",
         measures.t_grids,
+        measures.rows_of_grids("t"),
+        once=True,
     ),
     Figure(
         "15-success",
         "Success in training, against steps and against wall time",
-        f"Share of the episodes that end in the goal, sub-policies' own training not counted. {_BANDS}",
+        "Share of the episodes that end in the goal, over the last twentieth of the training each time; sub-policies' "
+        f"own training (4 to 8 M control steps, some 6 minutes) not counted. {_BANDS}",
         curves.success_curves,
         (
             *_on_kinds("bandit", schedules=("hrl",)),
@@ -218,11 +231,26 @@ FIGURES: tuple[Figure, ...] = (
     ),
     Figure(
         "19-choices",
-        "What the paper leaves open: B, the potential, the ant",
-        "IQM over seeds with 95 % intervals.",
+        "What the paper leaves open: B, the potential, the ant; and annealing",
+        "IQM over seeds with 95 % intervals; n is the number of seeds. Way: along the straight line.",
         measures.comparisons,
-        ("walker/plain", "walker/interleaved", "maze/hrl/plain", "maze/hrl/interleaved"),
-        compares_ants=True,
+        measures.COMPARED,
+        once=True,
+    ),
+    Figure(
+        "20-penalties",
+        "Stability penalties in the master's reward",
+        "The distance part of the reward, in the row's own potential, of masters trained with and without the "
+        f"penalties, averaged over the last twentieth of the training each time. {_BANDS}",
+        curves.penalty_curves,
+        tuple(
+            f"{place}/{schedule}{penalised}/{kind}"
+            for place in ("bandit", "maze")
+            for schedule in _SCHEDULES
+            for kind in ("appropriate-bias", "plain")
+            for penalised in ("", "-penalised")
+        ),
+        once=True,
     ),
 )
 
@@ -249,7 +277,7 @@ def draw_figures(results: Results, figures: Iterable[Figure], to: Path, prefix: 
 
     With a prefix such as ``light/``, the same of the rows under it, into a folder of that name: results of
     different engines and ants stay apart. Figures of which there is nothing under it are left out, and
-    those that compare ants themselves.
+    those of which there is one only.
     """
     note = "" if results.study.size.name == "full" else f"{results.study.size.name} study: short runs, few seeds"
     note = "runs of any length" if results.any_length else note
@@ -258,7 +286,7 @@ def draw_figures(results: Results, figures: Iterable[Figure], to: Path, prefix: 
     for figure in figures:
         rows = tuple(prefix + row for row in figure.rows if is_row(prefix + row))
         without = tuple(row for row in rows if not results.samples(row))
-        if prefix and (figure.compares_ants or len(without) == len(rows)):
+        if prefix and (figure.once or len(without) == len(rows)):
             continue
         with styled():
             files = save(figure.draw(results, rows), to / prefix / figure.name, note)

@@ -402,7 +402,8 @@ def versions() -> dict[str, str]:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
-    return {**found, "platform": platform.platform()}
+    system = "-".join((platform.system(), platform.machine(), *filter(None, platform.libc_ver())))
+    return {**found, "platform": system}
 
 
 @functools.cache

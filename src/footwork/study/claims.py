@@ -128,6 +128,7 @@ class Judgement:
     where: str  # engine, ant, the masters' reward and schedule
     findings: tuple[Finding, ...]
     verdict: Verdict
+    so_far: Verdict  # if the number of seeds is not asked for
     why: str
 
 
@@ -448,8 +449,8 @@ def judge(results: Results, claim: Claim, setting: Setting) -> Judgement:
     contrasts = [c for c in claim.contrasts if c.decides or all(is_row(setting.fill(row)) for row in c.rows)]
     findings = tuple(_find(results, claim, c, setting) for c in contrasts)
     deciding = [finding for finding in findings if finding.contrast.decides]
-    verdict = _overall([finding.verdict for finding in deciding])
-    return Judgement(claim, setting, _where(claim, setting), findings, verdict, _why(claim, deciding, verdict))
+    verdict, so_far = _overall([f.verdict for f in deciding]), _overall([f.so_far for f in deciding])
+    return Judgement(claim, setting, _where(claim, setting), findings, verdict, so_far, _why(claim, deciding, verdict))
 
 
 def _overall(verdicts: list[Verdict]) -> Verdict:

@@ -193,8 +193,9 @@ def _brief(judgements: Sequence[Judgement], named: bool = False) -> str:
     for j in judgements:
         deciding = [f for f in j.findings if f.contrast.decides and f.effect is not None]
         place = f"{j.where.removesuffix(f', {SCHEDULES[j.setting.schedule]}')}: " if named else ""
-        lines.append(f"{place}{j.verdict}")
-        lines += [_said(f) for f in ([f for f in deciding if f.so_far == j.verdict] or deciding)[:1]]
+        so_far = "" if j.verdict == j.so_far else f" (so far: {j.so_far})"
+        lines.append(f"{place}{j.verdict}{so_far if deciding else ': no runs yet'}")
+        lines += [_said(f) for f in ([f for f in deciding if f.so_far == j.so_far] or deciding)[:1]]
         lines += [f"and {len(deciding) - 1} more"] if len(deciding) > 1 else []
     return "\n".join(lines) or "-"
 
@@ -303,7 +304,9 @@ def _left_out(results: Results, drawn: Sequence[Drawn]) -> list[Block]:
         said = ", ".join(f"{row} {have} of {planned[row]}" for row, have in few.items())
         blocks.append(Text(f"Rows with fewer seeds than the study plans: {said}."))
     if results.problems:
-        blocks.append(TableBlock(("file or run",), tuple((problem,) for problem in results.problems)))
+        here = f"{results.study.runs}{os.sep}"
+        lines = tuple((problem.replace(here, ""),) for problem in results.problems)
+        blocks.append(TableBlock(("file or run",), lines))
     return blocks or [Text("Nothing.")]
 
 

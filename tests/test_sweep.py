@@ -226,7 +226,9 @@ def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
     assert (
         small.params["actor"]["output"]["bias"] == checkpoint.load_arrays(master.policy_path)[0]["actor/output/bias"]
     ).all()
-    assert find_needed(small, tmp_path).source == str(kept / NEEDED)
+    beside = find_needed(small, tmp_path)
+    assert beside.seeds == (1,)
+    assert (beside.params["actor"]["output"]["bias"] == 0.25).all()
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="ray is installed")

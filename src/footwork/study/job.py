@@ -15,14 +15,13 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from footwork import checkpoint
 from footwork.record import RunDir, RunError, RunInUse, config_to_json
 from footwork.study.measure import measure, measured
 from footwork.study.plan import Job, Size, Study
 from footwork.study.results import find_samples, read_curve
-from footwork.study.runs import NEEDED, load_run, run_path, train_row
+from footwork.study.runs import NEEDED, load_run, one_seed, run_path, train_row
 from footwork.train import Experiment, Interrupted, TrainingDiverged, policy_meta
 
 WAIT_FOR_LOCK = 120.0  # s; a run whose last process was killed may still be saving
@@ -76,21 +75,13 @@ def _place_needed(study: Study, experiment: Experiment, seed: int, path: Path) -
     if needed is None:
         raise RunError(f"{experiment.name} seed {seed} needs {experiment.needs} seed {seed}, which is not finished")
     trained = load_run(needed)
-    index = trained.seeds.index(seed)
-    params = {name: _one(tree, index) for name, tree in trained.params.items()}
+    params = one_seed(trained, trained.seeds.index(seed)).params
     if not (path / "config.json").is_file():
         RunDir.create(path, {"experiment": config_to_json(experiment), "seeds": [seed]})
     run = RunDir.open_existing(path)
     with run.lock():
         meta = policy_meta(trained.experiment, (seed,), int(needed.summary()["steps"]))
         checkpoint.save(path / NEEDED, params, {**meta, "from": trained.source})
-
-
-def _one(tree: Any, index: int) -> Any:
-    """One seed of parameters with the leading axis of seeds, which stays."""
-    if isinstance(tree, dict):
-        return {name: _one(branch, index) for name, branch in tree.items()}
-    return tree[index : index + 1]
 
 
 def main(arguments: list[str]) -> int:

@@ -13,7 +13,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from footwork.arena import CLEARANCE, DIRECTIONS, Arena, inside_walls
@@ -21,7 +20,7 @@ from footwork.checkpoint import write_atomically
 from footwork.evaluate import Episodes, play_episodes, transitions
 from footwork.record import RunDir, RunError, versions
 from footwork.study.plan import Size
-from footwork.study.runs import NEEDED, load_policies, load_run
+from footwork.study.runs import NEEDED, load_policies, load_run, one_seed
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment, Trained, choices_of
 
@@ -92,7 +91,8 @@ def measure(run: RunDir, size: Size, num_threads: int = 1) -> None:
     for name in files_of(trained.experiment):
         if problem_with(run, name, size) is None:
             continue
-        seeds = [makers[name](run, seed, size, num_threads) for seed in _one_by_one(trained)]
+        alone = (one_seed(trained, index) for index in range(len(trained.seeds)))
+        seeds = [makers[name](run, seed, size, num_threads) for seed in alone]
         task = trained.experiment.task
         content = {
             "format": FORMAT,
@@ -104,14 +104,6 @@ def measure(run: RunDir, size: Size, num_threads: int = 1) -> None:
             "by_seed": seeds,
         }
         write_atomically(run.path / name, json.dumps(content, allow_nan=False).encode() + b"\n")
-
-
-def _one_by_one(trained: Trained) -> list[Trained]:
-    """Each seed as if it had been trained alone."""
-    return [
-        trained._replace(seeds=(seed,), params=jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], trained.params))
-        for i, seed in enumerate(trained.seeds)
-    ]
 
 
 def _evaluation(run: RunDir, trained: Trained, size: Size, num_threads: int) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from footwork.study.figures import FIGURES, Drawn, draw_figures
 from footwork.study.measure import EVALUATION, TRANSITIONS
 from footwork.study.plan import STUDY_FILE, default_rows, plan, read_machine
 from footwork.study.results import CURVE, METRICS, Results, Sample, copy_curve, seeds_in_words
-from footwork.study.runs import NEEDED, read_actors
+from footwork.study.runs import read_actors
 from footwork.train import planned_steps
 
 RESULTS = "results"  # folder of a report, with the small files of its runs
@@ -351,9 +351,9 @@ def check_place(runs: Path, to: Path) -> None:
 def export(results: Results, to: Path) -> None:
     """Copy the small files of every run that was read: enough to draw and to judge again.
 
-    And policies, without their critics. All sub-policies, since masters stand on them: so ``footwork reproduce`` goes
-    on from a copy of this folder as it would from the runs themselves. Of every other row those of the first seed,
-    with the sub-policies that it was trained on: so each row can be watched and evaluated from here.
+    And policies, without their critics: of every seed where other rows stand on them, so that ``footwork reproduce``
+    goes on from a copy of this folder as it would from the runs themselves; else of the first seed, so that each row
+    can be watched and evaluated from here. A master finds its sub-policies beside it, under the same seed.
 
     What an earlier report wrote there stays until everything has been copied.
 
@@ -382,7 +382,7 @@ def export(results: Results, to: Path) -> None:
 
 
 def _copy_run(results: Results, sample: Sample, place: Path, row: str, first: bool) -> None:
-    run, walker = sample.run, sample.experiment.is_walker
+    run = sample.run
     place.mkdir(parents=True, exist_ok=True)
     for name in ("config.json", "DONE", EVALUATION, TRANSITIONS):
         if (run.path / name).is_file():
@@ -390,14 +390,14 @@ def _copy_run(results: Results, sample: Sample, place: Path, row: str, first: bo
     curve = results.whole_curve(sample)
     if curve is not None:
         copy_curve(curve, run, sample.experiment, place / CURVE)
-    for path in (run.policy_path, *(() if walker else (run.path / NEEDED,))):
-        if (walker or first) and path.is_file():
-            try:
-                actors, meta = read_actors(path)
-            except CheckpointError as error:
-                results.problems[f"{error}: the report's results lack it"] = None
-                continue
-            checkpoint.save(place / path.name, actors, meta)
+    stood_on = row in {experiment.needs for experiment in EXPERIMENTS.values()}
+    if (first or stood_on) and run.policy_path.is_file():
+        try:
+            actors, meta = read_actors(run.policy_path)
+        except CheckpointError as error:
+            results.problems[f"{error}: the report's results lack it"] = None
+        else:
+            checkpoint.save(place / run.policy_path.name, actors, meta)
 
 
 # Markdown and HTML ----------------------------------------------------------------------------------------------------

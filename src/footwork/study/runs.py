@@ -154,9 +154,9 @@ def _keep_needed(experiment: Experiment, run: RunDir, runs: Path, num_threads: i
         needed = _find_or_train_needed(experiment, runs, num_threads)
         if needed is None:
             return None
-        first = jax.tree.map(lambda leaf: leaf[:1], needed.params)
-        meta = policy_meta(needed.experiment, needed.seeds[:1], planned_steps(needed.experiment))
-        checkpoint.save(kept, first, {**meta, "from": needed.source})
+        first = one_seed(needed, 0)
+        meta = policy_meta(needed.experiment, first.seeds, planned_steps(needed.experiment))
+        checkpoint.save(kept, first.params, {**meta, "from": needed.source})
     return load_policies(kept)
 
 
@@ -287,7 +287,10 @@ def _load_packaged(row: str) -> Trained:
 
 
 def find_needed(trained: Trained, runs: Path) -> Trained | None:
-    """The policies that ``trained`` stands on: kept beside it, packaged with it, else what their row name means."""
+    """The policies that ``trained`` stands on: kept beside it or packaged with it, else what their row name means.
+
+    In a report's results they are not kept twice: there the row has a run of the same seed.
+    """
     needs = trained.experiment.needs
     if needs is None or not trained.experiment.is_master:
         return None
@@ -296,4 +299,24 @@ def find_needed(trained: Trained, runs: Path) -> Trained | None:
     kept = Path(trained.source).parent / NEEDED
     if trained.source != PACKAGED and kept.is_file():
         return load_policies(kept)
-    return find_trained(needs, runs)
+    same_seed = None if trained.source == PACKAGED else _beside(trained, needs)
+    return find_trained(needs, runs) if same_seed is None else same_seed
+
+
+def _beside(trained: Trained, needs: str) -> Trained | None:
+    """The policies of another row and the same seed, in the folder of runs that ``trained`` lies in."""
+    folder = Path(trained.source).resolve().parent
+    depth = len(Path(trained.experiment.name).parts)
+    if len(folder.parents) <= depth:
+        return None
+    for path in sorted((folder.parents[depth] / needs).glob("seed*/policy.safetensors")):
+        found = load_policies(path)
+        if trained.seeds[0] in found.seeds:
+            return one_seed(found, found.seeds.index(trained.seeds[0]))
+    return None
+
+
+def one_seed(trained: Trained, index: int) -> Trained:
+    """One of the seeds of a run, as if it had been trained alone."""
+    params = jax.tree.map(lambda leaf: leaf[index : index + 1], trained.params)
+    return trained._replace(seeds=trained.seeds[index : index + 1], params=params)

@@ -164,7 +164,7 @@ def direction_curves(results: Results, rows: tuple[str, ...]) -> Any:
             empty(ax, "no finished runs yet")
     for ax in axes[:, 0]:
         ax.set_ylabel("training reward per episode")
-    legend_below(figure, list(axes.flat))
+    legend_below(figure, list(axes.flat), columns=4)
     return figure
 
 

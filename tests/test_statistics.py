@@ -88,17 +88,12 @@ def test_a_mean_over_one_seed_agrees_with_theory():
     assert interval == pytest.approx((values.mean() - 0.196, values.mean() + 0.196), abs=0.03)
 
 
-def test_resamples_stay_in_their_stratum_and_may_keep_seeds_whole():
-    scores = np.array([[0.0, 10], [1, 11]])
-    apart = statistics.resample(scores, 4000, np.random.default_rng(0))
-    assert set(np.unique(apart[..., 0])) == {0, 1}
-    assert set(np.unique(apart[..., 1])) == {10, 11}
+def test_seeds_are_drawn_with_replacement_and_evenly():
+    drawn = statistics.draw_seeds(2, 4000, np.random.default_rng(0))
     # The mean of two draws of {0, 1} is 0, 1/2 or 1 with probability 1/4, 1/2, 1/4.
     np.testing.assert_allclose(
-        [(apart[..., 0].mean(axis=1) == value).mean() for value in (0, 0.5, 1)], (0.25, 0.5, 0.25), atol=0.03
+        [(drawn.mean(axis=1) == value).mean() for value in (0, 0.5, 1)], (0.25, 0.5, 0.25), atol=0.03
     )
-    whole = statistics.resample(scores, 100, np.random.default_rng(0), together=True)
-    np.testing.assert_array_equal(whole[..., 1] - whole[..., 0], 10)
 
 
 def test_a_difference_has_the_interval_that_scipy_finds():
@@ -118,6 +113,29 @@ def test_a_difference_has_the_interval_that_scipy_finds():
 def test_a_difference_of_differences():
     exact = statistics.contrast([[5.0] * 4, [1.0] * 4, [3.0] * 4, [2.0] * 4], (1, -1, -1, 1), np.random.default_rng(0))
     assert exact == (3, 3, 3)
+
+
+def test_runs_on_the_same_things_are_compared_pair_by_pair():
+    """Two masters on each of ten sub-policies that differ by 1.0, and by 0.1 beside: a paired comparison sees that."""
+    key, found = np.random.default_rng(5), {"paired": [], "apart": []}
+    shared, own = [("walker", i) for i in range(10)], [[("a", i) for i in range(10)], [("b", i) for i in range(10)]]
+    for _ in range(100):
+        base = key.normal(0, 1.0, 10)
+        one, other = base + 0.2 + key.normal(0, 0.1, 10), base + key.normal(0, 0.1, 10)
+        for name, units in (("paired", [shared, shared]), ("apart", own)):
+            found[name].append(statistics.contrast([one, other], (1, -1), key, draws=400, units=units))
+    width = {name: np.mean([e.high - e.low for e in effects]) for name, effects in found.items()}
+    covers = np.mean([e.low <= 0.2 <= e.high for e in found["paired"]])
+    assert width["paired"] < 0.35 * width["apart"]
+    assert covers >= 0.88
+    assert found["paired"][0].estimate == found["apart"][0].estimate
+    same = statistics.contrast([one, one], (1, -1), key, units=[shared, shared])
+    assert same == (0, 0, 0)
+
+
+def test_a_unit_for_every_score():
+    with pytest.raises(ValueError, match="one unit per score"):
+        statistics.contrast([[1.0, 2.0]], (1,), np.random.default_rng(0), units=[["a"]])
 
 
 def test_intervals_cover_as_often_as_they_say():

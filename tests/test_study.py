@@ -425,6 +425,26 @@ def test_verdicts_name_engine_and_ant_and_one_failing_comparison_is_enough(study
     assert verdicts(study, 12)["mujoco, heavy ant"].why == "no runs of walker/plain"
 
 
+def test_masters_on_the_same_sub_policies_are_compared_seed_by_seed(study):
+    """Each penalised master does 3 points worse than the free one that stands on the same sub-policies."""
+    quality = dict(enumerate(np.linspace(0.2, 0.9, 10)))
+    for seed, good in quality.items():
+        for kind in ("plain", "appropriate-bias"):
+            exactly(fake_run(study, f"bandit/paper/{kind}", seed), good)
+            exactly(fake_run(study, f"bandit/paper-penalised/{kind}", seed), good - 0.03)
+    found = verdicts(study, 13)["mujoco, heavy ant, the paper's reward and schedule"].findings
+    plain = next(f for f in found if f.contrast.words == "bandit, plain" and f.contrast.metric == "way")
+    assert plain.effect == pytest.approx((-0.03, -0.03, -0.03))
+    assert plain.verdict == "holds"  # apart, with seeds from 0.2 to 0.9, nothing could be said
+
+
+def exactly(path, good):
+    """A fake run's way, with nothing by chance."""
+    content = json.loads((path / "evaluation.json").read_text())
+    content["by_seed"][0]["way"] = good
+    (path / "evaluation.json").write_text(json.dumps(content))
+
+
 def test_a_claim_about_variance_compares_spreads(study):
     for i, row in enumerate(WALKERS):
         for seed in range(10):

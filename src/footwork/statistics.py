@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -74,15 +74,13 @@ def spread(scores: Floats) -> Floats:
     return np.sqrt(np.mean(np.var(scores, axis=-2, ddof=1 if scores.shape[-2] > 1 else 0), axis=-1))
 
 
-def resample(scores: Floats, draws: int, generator: np.random.Generator, together: bool = False) -> Floats:
-    """Bootstrap samples [draws, S, T] of scores [S, T]: seeds drawn with replacement.
+def draw_seeds(seeds: int, draws: int, generator: np.random.Generator) -> npt.NDArray[np.int64]:
+    """Which seeds a bootstrap draws, with replacement [draws, S].
 
-    Within each stratum on its own, as rliable does, or with ``together`` whole seeds, where the
-    strata of one seed depend on each other (four directions that were trained on one another's ants).
+    A seed comes with all its strata, where rliable draws within each on its own: here they depend on each
+    other (four directions that were trained on one another's ants).
     """
-    seeds, strata = scores.shape
-    chosen = generator.integers(0, seeds, (draws, seeds, 1 if together else strata))
-    return np.take_along_axis(scores[None], np.broadcast_to(chosen, (draws, seeds, strata)), axis=1)
+    return generator.integers(0, seeds, (draws, seeds))
 
 
 def percentile_interval(distribution: npt.ArrayLike, axis: int = 0) -> Floats:
@@ -97,11 +95,14 @@ def contrast(
     generator: np.random.Generator,
     statistic: Statistic = overall_iqm,
     draws: int = DRAWS,
+    units: Sequence[Sequence[Hashable]] | None = None,
 ) -> Effect:
     """A weighted sum of a statistic over groups of runs, with its stratified-bootstrap interval.
 
     The groups (rows of the table) are the strata: each is resampled on its own, by whole
     seeds. Weights (1, -1) make a difference, (1, -1, -1, 1) a difference of differences.
+    Groups whose runs stand on the same things (masters on the same sub-policies) are not
+    independent: those with the same units are drawn together, as in a paired comparison.
 
     Args:
         groups: scores [S] or [S, T] of each, as many seeds as there are.
@@ -109,15 +110,24 @@ def contrast(
         generator: of the resamples.
         statistic: over the last two axes.
         draws: resamples.
+        units: of each group, what each of its scores stands on; None: every score on something of its own.
 
     Raises:
-        ValueError: a group is empty or not finite, or there are not as many weights as groups.
+        ValueError: a group is empty or not finite, or there are not as many weights or units as groups or scores.
     """
     if len(groups) != len(weights) or not groups:
         raise ValueError(f"as many weights as groups, got {len(weights)} and {len(groups)}")
     scores = [as_scores(group) for group in groups]
+    if units is not None and [len(each) for each in units] != [len(each) for each in scores]:
+        raise ValueError(f"one unit per score, got {[len(u) for u in units]} for {[len(s) for s in scores]}")
     estimate = sum(w * float(statistic(s)) for w, s in zip(weights, scores, strict=True))
-    samples = [statistic(resample(s, draws, generator, together=True)) for s in scores]
+    chosen: dict[Hashable, npt.NDArray[np.int64]] = {}
+    samples = []
+    for i, group in enumerate(scores):
+        shared: Hashable = i if units is None else tuple(units[i])
+        if shared not in chosen:
+            chosen[shared] = draw_seeds(len(group), draws, generator)
+        samples.append(statistic(group[chosen[shared]]))
     total = sum((w * s for w, s in zip(weights, samples, strict=True)), np.zeros(draws))
     low, high = percentile_interval(total)
     return Effect(float(estimate), float(low), float(high))
@@ -147,8 +157,7 @@ def performance_profile(scores: npt.ArrayLike, thresholds: npt.ArrayLike) -> Flo
 def curve_band(curves: npt.ArrayLike, generator: np.random.Generator, draws: int = DRAWS) -> tuple[Floats, Floats]:
     """IQM over seeds of curves [S, X] and its interval [2, X]; a curve is drawn whole."""
     values = np.asarray(curves, np.float64)
-    chosen = generator.integers(0, len(values), (draws, len(values)))
-    samples = iqm(values[chosen], axis=1)
+    samples = iqm(values[draw_seeds(len(values), draws, generator)], axis=1)
     return iqm(values, axis=0), percentile_interval(samples)
 
 
@@ -209,6 +218,7 @@ __all__ = [
     "as_scores",
     "contrast",
     "curve_band",
+    "draw_seeds",
     "generator_for",
     "iqm",
     "mean_over_seeds",
@@ -217,7 +227,6 @@ __all__ = [
     "performance_profile",
     "probability_of_improvement",
     "rate_over_seeds",
-    "resample",
     "spread",
     "wilson",
 ]

@@ -2,7 +2,8 @@
 
 A claim compares rows of the table in a metric (:data:`footwork.study.results.METRICS`).
 Each comparison is a contrast of interquartile means over seeds with a 95 % stratified-bootstrap
-interval. Rules, where E is the estimate, [L, U] the interval and m the smallest difference that matters:
+interval; masters that stand on the same sub-policies are drawn together. Rules, where E is the
+estimate, [L, U] the interval and m the smallest difference that matters:
 
 ==============  =========================  ================================
 rule            holds                      does not hold
@@ -461,16 +462,23 @@ def _overall(verdicts: list[Verdict]) -> Verdict:
 
 def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> Finding:
     rows = tuple(setting.fill(row) for row in what.rows)
-    scores = [results.scores(row, what.metric) if is_row(row) else np.zeros(0) for row in rows]
+    by_seed = [results.scores_by_seed(row, what.metric) if is_row(row) else {} for row in rows]
+    scores = [np.array(list(score.values()), np.float64) for score in by_seed]
     seeds = tuple(len(score) for score in scores)
     if not all(seeds):
         return Finding(what, rows, seeds, None, None, "undecided", "undecided")
     statistic: Statistic = spread if what.statistic == "spread" else overall_iqm
     generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
-    effect = contrast(scores, what.weights, generator, statistic)
+    units = [[(_trained(row), seed) for seed in score] for row, score in zip(rows, by_seed, strict=True)]
+    effect = contrast(scores, what.weights, generator, statistic, units=units)
     so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"
     verdict = so_far if min(seeds) >= claim.min_seeds else "undecided"
     return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far)
+
+
+def _trained(row: str) -> str:
+    """The row whose runs a row's seeds stand on: a master's sub-policies, anything else's own."""
+    return find_row(row).sub_policies or row
 
 
 def _probability(what: Contrast, scores: list[Floats]) -> float | None:

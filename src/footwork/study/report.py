@@ -129,17 +129,17 @@ def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> lis
 
 _READING = (
     "An effect is a difference of interquartile means over seeds (of shares: in percentage points) with its 95 % "
-    "stratified-bootstrap interval, seeds drawn within each row. P is the probability that a run of the first row "
-    "scores higher than one of the second. Rules, margins and the number of seeds asked for stood in "
+    "stratified-bootstrap interval, whole seeds drawn within each row. P is the probability that a run of the first "
+    "row scores higher than one of the second. Rules, margins and the number of seeds asked for stood in "
     "footwork/study/claims.py before the runs. Masters and flat policies are judged by the way: how much nearer to "
     "the goal an episode ends than it began, along the straight line, as a share of the distance at the start. That "
     "is the distance part of the paper's reward, which is what it plots; on AntMaze it calls an ant at the wall "
     "nearer than one half-way around it, so success and the way around the walls stand beside it. Comparisons that "
     "are only shown do not decide; most of them were added after the first seeds had been seen. Differences that were "
-    "to be at least the bound and are smaller, or of the other sign, do not hold. Seeds are drawn within each row, as "
-    "if rows were independent; masters of one seed share sub-policies, so that intervals of their differences are "
-    "rather too wide than too narrow. Nothing is corrected for the number of comparisons. With 10 seeds such an "
-    "interval covers the truth about 95 times in 100, with 3 under 80 times (normal scores, simulated)."
+    "to be at least the bound and are smaller, or of the other sign, do not hold. Masters that stand on the same "
+    "sub-policies are not independent: their seeds are drawn together, as in a paired comparison (claims 9 and 13; "
+    "decided before a penalised master was trained). Nothing is corrected for the number of comparisons. With 10 "
+    "seeds such an interval covers the truth 92 to 96 times in 100, with 3 under 80 times (normal scores, simulated)."
 )
 _ROWS = (
     "Interquartile means over seeds. Control steps: of one run, all its directions counted. Minutes: of training, mean "

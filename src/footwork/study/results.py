@@ -112,10 +112,18 @@ class Results:
         Raises:
             ValueError: there is no such row or metric.
         """
+        return np.array(list(self.scores_by_seed(row, metric).values()), np.float64)
+
+    def scores_by_seed(self, row: str, metric: str) -> dict[int, Any]:
+        """A metric of each of a row's seeds that has it.
+
+        Raises:
+            ValueError: there is no such row or metric.
+        """
         if metric not in METRICS:
             raise ValueError(f"unknown metric {metric!r}; known metrics: {', '.join(METRICS)}")
-        values = (METRICS[metric].of(self, sample) for sample in self.samples(row))
-        return np.array([value for value in values if value is not None], np.float64)
+        values = ((sample.seed, METRICS[metric].of(self, sample)) for sample in self.samples(row))
+        return {seed: value for seed, value in values if value is not None}
 
     def all_samples(self) -> dict[str, tuple[Sample, ...]]:
         """Every row that has been asked for so far, and its seeds."""

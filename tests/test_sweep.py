@@ -150,8 +150,9 @@ def test_kill_minus_nine_of_the_sweep_loses_nothing(stage, tmp_path):
         process.wait()
         time.sleep(0.5)  # the runs see that they are alone, and end
         finished = {str(done.parent.relative_to(stage.study.runs)) for done in stage.study.runs.rglob("DONE")}
-        before = stage.started()
-        assert all(before.count(place) >= 1 for place in finished)
+        for place in finished:  # what is marked as done is whole
+            kept, whole = stage.study.runs / place, stage.shelf / place
+            assert all((kept / file.name).read_bytes() == file.read_bytes() for file in whole.iterdir())
     done = {str(path.parent.relative_to(stage.study.runs)) for path in stage.study.runs.rglob("DONE")}
     before = len(stage.started())
     board = stage.run(workers=2)
@@ -162,6 +163,58 @@ def test_kill_minus_nine_of_the_sweep_loses_nothing(stage, tmp_path):
         assert (place / "metrics.jsonl").read_bytes() == (
             run_path(stage.shelf, one.row, (one.seed,)) / "metrics.jsonl"
         ).read_bytes()
+
+
+def test_a_sweep_that_is_asked_to_stop_lets_its_runs_save_and_says_how_to_go_on(stage, tmp_path):
+    """SIGTERM in the middle: every run is asked to end, none is left behind, and the next sweep makes the rest."""
+    code = KILLED.format(tests=os.path.dirname(__file__), path=str(tmp_path))
+    command = [sys.executable, "-c", code]
+    environment = {**os.environ, "STAND_IN_SECONDS": "30"}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 60
+    while len(stage.started()) < 2 and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    begun = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=60)
+    assert time.monotonic() - begun < 20  # the runs, of 30 s, did not have to be waited for
+    assert "SweepStopped: stopped: 0 of 8 runs done" in said
+    assert "call it again to go on" in said
+    board = stage.run(workers=2)
+    assert (len(board.done), board.failed) == (8, {})
+
+
+def test_two_sweeps_do_not_share_cores(monkeypatch, tmp_path):
+    monkeypatch.setattr(sweep.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(sweep.os, "sched_getaffinity", lambda _: {0, 1, 2}, raising=False)
+    with sweep._cores(2) as one:
+        assert one == [0, 1]
+        with sweep._cores(1) as other:
+            assert other == [2]
+        with sweep._cores(2) as too_many:
+            assert too_many == [None, None]  # the system shares out what is left
+    with sweep._cores(0) as again:
+        assert again == [0, 1, 2]
+    with sweep._cores(4) as more_than_there_are:
+        assert more_than_there_are == [None] * 4
+
+
+def test_what_earlier_sweeps_did_is_not_this_ones_speed(stage):
+    one, other = stage.jobs[0], stage.jobs[1]
+    place = run_path(stage.study.runs, one.row, (one.seed,))
+    place.mkdir(parents=True)
+    taken = int(0.9 * one.steps) // 4
+    (place / "metrics.jsonl").write_text(json.dumps({"step": taken}) + "\n")
+    board = sweep.Board.of(stage.study, stage.jobs, set())
+    board.begun -= 100.0
+    board.begin(one)
+    assert board.rate() == 0
+    assert board.seconds_left() is None
+    (place / "metrics.jsonl").write_text(json.dumps({"step": taken + 1000}) + "\n")
+    assert board.rate() == pytest.approx(0.85 * 4 * 1000 / 100, rel=0.01)
+    board.put_back(one)
+    board.begin(other)
+    assert board.rate() == pytest.approx(0.85 * 4 * 1000 / 100, rel=0.01)  # it is still counted
 
 
 def test_the_board_counts_steps_and_time(stage):

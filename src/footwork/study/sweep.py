@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import timedelta
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from footwork.train import planned_steps
 POLL = 0.25  # s between two looks at the processes
 PLAIN_EVERY = 60.0  # s between two lines of progress where there is no terminal
 STOP_WITHIN = 60.0  # s that processes get to save themselves
+LAUNCHERS = ("local", "ray")
 RETRIES = 3  # of a run whose process, or whose node in a cluster, was lost
 _MEASURING = 0.15  # of a run's time, that comes after its last control step
 _TAIL = 1 << 16  # bytes of metrics in which the last whole line lies
@@ -47,7 +49,16 @@ class Board:
     failed: dict[Job, str] = field(default_factory=dict)  # with the reason
     killed: dict[Job, int] = field(default_factory=dict)  # how often a run's process was killed, or asked to stop
     begun: float = field(default_factory=time.monotonic)
+    waiting: dict[Job, int] = field(default_factory=dict)  # steps that runs have taken that are not at work now
     steps_at_begin: int = 0
+
+    @classmethod
+    def of(cls, study: Study, jobs: Sequence[Job], done: set[Job]) -> Board:
+        """The board of a sweep that begins: what earlier ones did is not this one's speed."""
+        board = cls(study, jobs, done)
+        board.waiting = {job: steps for job in jobs if job not in done and (steps := steps_of(study, job))}
+        board.steps_at_begin = board.steps_done()
+        return board
 
     def ready(self) -> Iterator[Job]:
         """Runs that could start now, in the order of the plan."""
@@ -56,6 +67,16 @@ class Board:
             waiting = job not in self.done and job not in self.active and job not in self.failed
             if waiting and (job.needs is None or (job.needs, job.seed) in finished):
                 yield job
+
+    def begin(self, job: Job) -> None:
+        """Note that a run is at work."""
+        self.waiting.pop(job, None)
+        self.active.add(job)
+
+    def put_back(self, job: Job) -> None:
+        """Note that a run has to go on later."""
+        self.active.discard(job)
+        self.waiting[job] = steps_of(self.study, job)
 
     def fail(self, job: Job, reason: str) -> None:
         """Note that a run failed, and all that would have stood on it."""
@@ -71,8 +92,9 @@ class Board:
         self.done.add(job)
 
     def steps_done(self) -> int:
-        """Control steps of all runs, finished and under way."""
-        return sum(job.steps for job in self.done) + sum(steps_of(self.study, job) for job in self.active)
+        """Control steps of all runs, finished, under way and begun earlier."""
+        finished, under_way = sum(job.steps for job in self.done), sum(steps_of(self.study, job) for job in self.active)
+        return finished + under_way + sum(self.waiting.values())
 
     def rate(self) -> float:
         """Control steps per second since this sweep began."""
@@ -118,7 +140,7 @@ def run_study(
     Args:
         study: the folder and its size.
         jobs: from :func:`footwork.study.plan.plan`.
-        workers: runs at once on this machine; 0: one per core.
+        workers: runs at once; 0: one per core of this machine, or of the cluster.
         launcher: ``local`` or ``ray``.
         address: of the Ray cluster.
         log: gets a line for everything that happens.
@@ -129,20 +151,21 @@ def run_study(
         ImportError: the extra ``footwork[ray]`` is missing.
         SweepStopped: SIGINT or SIGTERM came.
     """
-    launchers = {"local": _run_local, "ray": _run_on_ray}
-    if launcher not in launchers:
-        raise ValueError(f"unknown launcher {launcher!r}; known launchers: {', '.join(launchers)}")
+    if launcher not in LAUNCHERS:
+        raise ValueError(f"unknown launcher {launcher!r}; known launchers: {', '.join(LAUNCHERS)}")
     if workers < 0:
         raise ValueError(f"workers must be >= 0, got {workers}")
     with _only_one(study.runs):
         done, problems = completed(study, jobs)
         for problem in problems:
             log(problem)
-        board = Board(study, jobs, done)
-        board.steps_at_begin = board.steps_done()
+        board = Board.of(study, jobs, done)
         log(board.line().partition(",")[0] + f"; {sum(job.steps for job in jobs):,} control steps in all")
         if len(board.done) < len(jobs):
-            launchers[launcher](board, workers, address, log)
+            if launcher == "ray":
+                _run_on_ray(board, workers, address, log)
+            else:
+                _run_local(board, workers, log)
     return board
 
 
@@ -236,11 +259,10 @@ def _reason(study: Study, job: Job, status: int) -> str:
     return f"exit status {status}"
 
 
-def _run_local(board: Board, workers: int, address: str, log: Callable[[str], None]) -> None:
-    cores = _cores(workers)
+def _run_local(board: Board, workers: int, log: Callable[[str], None]) -> None:
     at_work: dict[int, _Worker] = {}
     try:
-        with _signals_stop(), _display(board, log) as show:
+        with _signals_stop(), _cores(workers) as cores, _display(board, log) as show:
             while len(board.done) + len(board.failed) < len(board.jobs):
                 _start_ready(board, cores, at_work)
                 time.sleep(POLL)
@@ -253,11 +275,28 @@ def _run_local(board: Board, workers: int, address: str, log: Callable[[str], No
         _stop_all([worker.process for worker in at_work.values()])
 
 
-def _cores(workers: int) -> list[int | None]:
-    """The core of each worker; None where there are more workers than cores, or cores cannot be chosen."""
+@contextlib.contextmanager
+def _cores(workers: int) -> Iterator[list[int | None]]:
+    """The core of each worker, that no other sweep has; None where there are not enough, or they cannot be chosen."""
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     count = workers or len(available) or os.cpu_count() or 1
-    return [available[i] if count <= len(available) else None for i in range(count)]
+    place = Path(tempfile.gettempdir()) / f"footwork-cores-{os.getuid()}"
+    with contextlib.ExitStack() as held:
+        mine: list[int] = []
+        with contextlib.suppress(OSError):  # nowhere to say which are taken: the system shares them out
+            place.mkdir(exist_ok=True)
+            for core in available:
+                file = (place / str(core)).open("a")
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    file.close()
+                    continue
+                held.enter_context(file)
+                mine.append(core)
+                if len(mine) == count:
+                    break
+        yield list(mine) if len(mine) == count else [None] * count
 
 
 def _start_ready(board: Board, cores: Sequence[int | None], at_work: dict[int, _Worker]) -> None:
@@ -268,7 +307,7 @@ def _start_ready(board: Board, cores: Sequence[int | None], at_work: dict[int, _
         if job is None:
             return
         at_work[place] = _start(board.study, job, core, board.study.runs / "cache")
-        board.active.add(job)
+        board.begin(job)
 
 
 def _collect_finished(board: Board, at_work: dict[int, _Worker], log: Callable[[str], None]) -> None:
@@ -287,7 +326,7 @@ def _settle(board: Board, job: Job, status: int, seconds: float, log: Callable[[
         return
     if (status < 0 or status == STOPPED) and board.killed.get(job, 0) < RETRIES:  # it goes on from its checkpoint
         board.killed[job] = board.killed.get(job, 0) + 1
-        board.active.discard(job)
+        board.put_back(job)
         log(f"{job.name}: its process was ended (status {status}); it goes on")
         return
     before = set(board.failed)
@@ -372,47 +411,43 @@ def board_table(board: Board) -> Any:
 
 
 def _run_on_ray(board: Board, workers: int, address: str, log: Callable[[str], None]) -> None:
-    """The same processes as tasks of a Ray cluster that shares the folder; Ray decides where and when.
+    """The same processes as tasks of a Ray cluster that shares the folder; Ray decides where they run.
 
-    A run that stands on another is a task that waits for it. The task of a node that is
+    As many are with Ray as the cluster has cores, so that nodes may come and go. The task of a node that is
     lost starts again elsewhere, and goes on from the run's checkpoint.
     """
     ray = _connect(address)
     remote = ray.remote(num_cpus=1, max_retries=RETRIES)(run_job)
-    references: dict[tuple[str, int], Any] = {}
-    by_reference: dict[Any, Job] = {}
-    for job in board.jobs:
-        if job in board.done:
-            continue
-        before = references.get((job.needs or "", job.seed))
-        task = remote.options(name=job.name)
-        reference = task.remote(_as_json(board.study), job.row, job.seed, job.steps, job.needs, before)
-        references[job.row, job.seed] = reference
-        by_reference[reference] = job
-        board.active.add(job)
+    at_work: dict[Any, Job] = {}
     try:
         with _signals_stop(), _display(board, log) as show:
-            _wait_for_tasks(ray, board, by_reference, log, show)
+            while len(board.done) + len(board.failed) < len(board.jobs):
+                places = workers or int(ray.cluster_resources().get("CPU", 0))
+                for job in list(islice(board.ready(), max(0, places - len(at_work)))):
+                    asked = (_as_json(board.study), job.row, job.seed, job.steps, job.needs)
+                    at_work[remote.options(name=job.name).remote(*asked)] = job
+                    board.begin(job)
+                _collect_tasks(ray, board, at_work, log)
+                show(board)
     except KeyboardInterrupt:
-        for reference in by_reference:
+        for reference in at_work:
             ray.cancel(reference, force=True)
         raise SweepStopped(f"stopped: {board.line()}; call it again to go on") from None
 
 
-def _wait_for_tasks(ray: Any, board: Board, waiting: dict[Any, Job], log: Callable[[str], None], show: Display) -> None:
-    while waiting:
-        finished, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
-        for reference in finished:
-            job = waiting.pop(reference)
-            try:
-                status, seconds = ray.get(reference)
-            except ray.exceptions.RayError as error:
-                status, seconds = -1, 0.0
-                log(f"{job.name}: {str(error).strip().splitlines()[-1]}")
-            if job not in board.failed:
-                board.killed[job] = RETRIES  # Ray has tried again already
-                _settle(board, job, status, seconds, log)
-        show(board)
+def _collect_tasks(ray: Any, board: Board, at_work: dict[Any, Job], log: Callable[[str], None]) -> None:
+    if not at_work:
+        time.sleep(POLL)  # a cluster without cores, for now
+        return
+    finished, _ = ray.wait(list(at_work), num_returns=1, timeout=1.0)
+    for reference in finished:
+        job = at_work.pop(reference)
+        try:
+            status, seconds = ray.get(reference)
+        except ray.exceptions.RayError as error:
+            status, seconds = -1, 0.0
+            log(f"{job.name}: {str(error).strip().splitlines()[-1]}")
+        _settle(board, job, status, seconds, log)
 
 
 def _connect(address: str) -> Any:
@@ -443,10 +478,8 @@ def _knock(address: str) -> None:
         socket.create_connection((host, int(port)), timeout=5.0).close()
 
 
-def run_job(
-    study: Mapping[str, Any], row: str, seed: int, steps: int, needs: str | None, before: Any
-) -> tuple[int, float]:
-    """A run's process on a node of the cluster; its exit status and seconds. ``before`` is only waited for."""
+def run_job(study: Mapping[str, Any], row: str, seed: int, steps: int, needs: str | None) -> tuple[int, float]:
+    """A run's process on a node of the cluster; its exit status and seconds."""
     begun = time.monotonic()
     job = Job(row, seed, needs, steps)
     here = Study(Path(study["runs"]), Size.from_json(study["size"]))

@@ -12,8 +12,8 @@ from footwork.evaluate import SWITCHING_PERIODS
 from footwork.record import config_to_json, versions
 from footwork.study.measure import FORMAT, straight_line_stop
 from footwork.study.plan import FULL
-from footwork.study.results import BINS
 from footwork.study.runs import run_path
+from footwork.study.training_curves import BINS
 from footwork.train import planned_steps, steps_per_iteration
 
 QUALITY = {"plain": 0.35, "random-start": 0.45, "random-repeated": 0.5, "appropriate-bias": 0.6, "free": 0.2}

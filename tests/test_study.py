@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ from footwork.doors.cli import run
 from footwork.evaluate import Episodes
 from footwork.record import RunDir, RunError, read_metrics
 from footwork.statistics import Effect, iqm
-from footwork.study import answers, claims, measure, plan, report, results
+from footwork.study import answers, claims, measure, plan, report, results, training_curves
 from footwork.study.experiments import EXPERIMENTS, GRIDS, MAIN, find_row, match_rows
 from footwork.study.figures import FIGURES, draw_figures, find_figures, style
+from footwork.study.metrics import METRICS
 from footwork.study.plan import FULL, QUICK, Study
 
 WALKERS = ("walker/plain", "walker/random-start", "walker/random-repeated", "walker/appropriate-bias")
@@ -172,7 +174,7 @@ def test_fluctuation_is_not_fooled_by_a_trend(study, monkeypatch):
 def test_curves_are_the_runs_metrics_in_bins(study):
     path = fake_run(study, "walker/plain", 0, lines=40)
     run, experiment = RunDir(path), find_row("walker/plain")
-    curve = results.read_curve(run, experiment)
+    curve = training_curves.read_curve(run, experiment)
     lines = read_metrics(run.metrics_path)
     assert curve.step[-1] == run.summary()["steps"]
     np.testing.assert_array_equal(curve.episodes.sum(axis=0), np.sum([line["episode/count"] for line in lines], axis=0))
@@ -180,21 +182,23 @@ def test_curves_are_the_runs_metrics_in_bins(study):
     counts = np.array([line["episode/count"] for line in late])
     returns = np.nan_to_num(np.array([line["episode/return"] for line in late]))
     np.testing.assert_allclose(
-        results.final(curve, "return"), (counts * returns).sum(axis=0) / counts.sum(axis=0), rtol=1e-4
+        training_curves.mean_between(curve, "return", 0.9, 1.0),
+        (counts * returns).sum(axis=0) / counts.sum(axis=0),
+        rtol=1e-4,
     )
     run.metrics_path.unlink()  # what is kept of the curve is enough, and nearly the same
-    kept = results.read_curve(run, experiment)
+    kept = training_curves.read_curve(run, experiment)
     np.testing.assert_allclose(kept.values["return"], curve.values["return"], rtol=1e-4)
     other = fake_run(study, "walker/plain", 1)  # a curve of another run is no curve of this one
-    results.read_curve(RunDir(other), experiment)
-    shutil.copyfile(other / results.CURVE, path / results.CURVE)
+    training_curves.read_curve(RunDir(other), experiment)
+    shutil.copyfile(other / training_curves.CURVE, path / training_curves.CURVE)
     for _ in range(2):
         with pytest.raises(RunError, match=r"curve\.json is damaged, or of another run.*metrics\.jsonl is not there"):
-            results.read_curve(run, experiment)
-        (path / results.CURVE).write_bytes((other / results.CURVE).read_bytes()[:-9])
-    (path / results.CURVE).unlink()
+            training_curves.read_curve(run, experiment)
+        (path / training_curves.CURVE).write_bytes((other / training_curves.CURVE).read_bytes()[:-9])
+    (path / training_curves.CURVE).unlink()
     with pytest.raises(RunError, match=r"curve\.json is missing, and .*metrics\.jsonl is not there"):
-        results.read_curve(run, experiment)
+        training_curves.read_curve(run, experiment)
 
 
 def test_what_does_not_count_is_left_out_by_name(study):
@@ -239,8 +243,12 @@ def test_what_does_not_count_is_left_out_by_name(study):
         (lambda path: write(path, {**json.loads(path.read_text()), "size": "quick"}), "is of the quick study"),
         (
             lambda path: write(path, {**json.loads(path.read_text()), "by_seed": [{"seed": 0, "way": 0.5}]}),
-            "of another version of footwork: it does not say success, stuck, ends",
+            "of another version of footwork: it does not say fall_rate",
         ),
+        (lambda path: with_entry(path, success={}), "of another version of footwork: it does not say 0.45"),
+        (lambda path: with_entry(path, way="far"), "is damaged: not every number in it is one"),
+        (lambda path: with_entry(path, ends=[[1.0, 2.0], [3.0]]), "is damaged: not every number in it is one"),
+        (lambda path: with_entry(path, paths=[{"xy": 3, "choices": []}]), "is damaged: not every number in it is one"),
         (lambda path: write(path, {**json.loads(path.read_text()), "by_seed": [3]}), "holds no entries"),
     ],
 )
@@ -252,6 +260,27 @@ def test_damaged_measurements_are_named_and_how_to_make_them_again(study, damage
     (problem,) = found.problems
     assert message in problem
     assert "footwork reproduce --rows maze/flat/free makes it again" in problem
+
+
+def with_entry(path, **fields):
+    content = json.loads(path.read_text())
+    content["by_seed"][0] |= fields
+    write(path, content)
+
+
+@pytest.mark.parametrize("values", [[], {}, {"return": [[1.0]], "progress": [[1.0]], "success": [[1.0]]}, None])
+def test_a_damaged_curve_is_made_again_where_the_metrics_are_and_named_where_they_are_not(study, values):
+    path = fake_run(study, "walker/plain", 0)
+    run, experiment = RunDir(path), find_row("walker/plain")
+    whole = training_curves.read_curve(run, experiment)
+    content = json.loads((path / training_curves.CURVE).read_text())
+    write(path / training_curves.CURVE, {**content, "values": values})
+    np.testing.assert_array_equal(training_curves.read_curve(run, experiment).step, whole.step)
+    write(path / training_curves.CURVE, {**content, "values": values})
+    run.metrics_path.unlink()
+    found = results.Results(study)
+    assert len(found.scores("walker/plain", "return")) == 0
+    assert any("curve.json is damaged" in problem for problem in found.problems)
 
 
 def test_folders_that_no_row_would_find_are_named(study):
@@ -294,6 +323,48 @@ def test_a_report_replaces_what_a_report_wrote_and_nothing_else(study, tmp_path,
         assert len(list((to / "results").rglob("DONE"))) == 2
         assert not list(to.glob(".results*"))
         assert "the report's results lack it" in (to / "REPORT.md").read_text()
+
+
+def test_a_report_of_fewer_runs_never_replaces_one_of_more(study, tmp_path, capsys, monkeypatch):
+    fill(study, ("walker/plain",), 3)
+    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
+    to = tmp_path / "out"
+    assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 0
+    few = Study(tmp_path / "few")
+    fill(few, ("walker/plain",), 1)
+    asked = ["--rows", "walker/plain", "--seeds", "1", "--runs", str(few.runs), "--to", str(to)]
+    for command in (["report", "--runs", str(few.runs), "--to", str(to)], ["reproduce", *asked]):
+        assert run(command) == 1
+        said = capsys.readouterr().err
+        assert "it holds 2 finished runs that" in said
+        assert "walker/plain/seed-1 among them" in said
+        assert f"cp -r {to / 'results'} {few.runs}" in said
+    assert len(list((to / "results").rglob("DONE"))) == 3
+
+
+def test_results_that_a_killed_report_had_put_aside_come_back(study, tmp_path, monkeypatch):
+    fill(study, ("walker/plain",), 2)
+    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
+    to = tmp_path / "out"
+    assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 0
+    (to / "results").rename(to / ".results.old")  # as a kill between the two renames leaves it
+    fill(Study(tmp_path / "few"), ("walker/plain",), 1)
+    assert run(["report", "--runs", str(tmp_path / "few"), "--to", str(to)]) == 1
+    assert len(list((to / "results").rglob("DONE"))) == 2
+    assert not (to / ".results.old").exists()
+
+
+def test_runs_on_another_engine_are_found_whatever_they_are_and_keep_what_others_stand_on(study, tmp_path, monkeypatch):
+    fill(study, ("bullet/maze/flat/free",), 2)
+    found = results.Results(study)
+    assert claims.prefixes_at_hand(found) == ("", "bullet/")
+    assert "bullet/maze/flat/free" in report.all_rows(found)
+    fill(study, ("bullet/walker/plain",), 2)
+    (study.runs / "bullet/walker/plain/seed-1/policy.safetensors").write_bytes(b"torn")
+    found = results.Results(study)
+    found.samples("bullet/walker/plain")
+    report.export(found, tmp_path / "out/results")
+    assert any("the report's results lack it" in problem for problem in found.problems)  # the second seed's is wanted
 
 
 def test_a_report_of_nothing_is_refused_with_the_reasons(study, tmp_path, capsys):
@@ -360,7 +431,7 @@ def test_claims_read_rows_that_exist_with_metrics_that_exist():
         assert claims.settings_of(claim)
         assert claim.min_seeds >= 10
         for what in claim.contrasts:
-            assert what.metric in results.METRICS
+            assert what.metric in METRICS
             assert len(what.rows) == len(what.weights)
     everywhere = {claim.number for claim in claims.CLAIMS if claim.everywhere}
     assert everywhere == {7, 8, 9, 10, 11, 12, 14}
@@ -435,7 +506,34 @@ def test_masters_on_the_same_sub_policies_are_compared_seed_by_seed(study):
     found = verdicts(study, 13)["mujoco, heavy ant, the paper's reward and schedule"].findings
     plain = next(f for f in found if f.contrast.words == "bandit, plain" and f.contrast.metric == "way")
     assert plain.effect == pytest.approx((-0.03, -0.03, -0.03))
-    assert plain.verdict == "holds"  # apart, with seeds from 0.2 to 0.9, nothing could be said
+    assert plain.verdict == "holds"
+    assert plain.apart.low < -0.1  # with seeds from 0.2 to 0.9, nothing could be said
+    exactly(fake_run(study, "bandit/paper/plain", 10), 0.1)  # has no counterpart, and is left out by name
+    held = results.Results(study)
+    found = next(j for j in claims.judge_all(held) if j.claim.number == 13 and j.setting.schedule == "paper").findings
+    again = next(f for f in found if f.contrast.words == "bandit, plain" and f.contrast.metric == "way")
+    assert (again.effect, again.seeds) == (plain.effect, (10, 10))
+    assert any("bandit/paper/plain: seeds without a counterpart" in problem for problem in held.problems)
+
+
+def test_a_verdict_rests_on_what_decided_and_names_what_is_missing(study):
+    fill(study, ("bandit/flat/free",), 10, quality=0.3)
+    fill(study, ("bandit/flat/penalised",), 10, quality=0.9)
+    found = verdicts(study, 3)["mujoco, heavy ant, the paper's reward and schedule"]
+    assert found.verdict == "does not hold"
+    said = "10 seeds or more on every side; the other way round: bandit; no runs of maze/flat/{free,penalised}"
+    assert found.why == said
+
+
+def test_a_difference_that_had_no_room_is_said_to_have_had_none(study):
+    fill(study, ("walker/random-repeated",), 10, quality=0.99)
+    fill(study, ("walker/random-start", "walker/appropriate-bias"), 10, quality=0.5)
+    assert re.search(
+        r"against random-repeated, no more than \d\.\d points were possible",
+        verdicts(study, 10)["mujoco, heavy ant"].why,
+    )
+    metrics = {f.contrast.metric for f in verdicts(study, 10)["mujoco, heavy ant"].findings}
+    assert metrics == {"handover", "moving"}
 
 
 def exactly(path, good):
@@ -469,7 +567,15 @@ def test_figures_are_drawn_from_files_alone(study, tmp_path):
     drawn = draw_figures(found, find_figures(names), tmp_path / "once")
     for one in drawn:
         assert [path.suffix for path in one.files] == [".png", ".svg"]
-        assert all(path.stat().st_size > 5000 for path in one.files)
+        assert one.files[0].read_bytes().startswith(b"\x89PNG")
+    shown = {one.figure.name: one.files[1].read_text() for one in drawn}
+    for name, words in {
+        "07-unregularised": ("control steps per direction", ">down<", "(2 seeds)"),
+        "11-handovers": ("symmetric-interleaved", "2 seeds", "no finished runs yet"),
+        "16-paths": ("sub-policy up", "maze/flat/free", "within 1 m"),
+        "17-flat-ends": ("% in the circle, 2 seeds", "end of an episode"),
+    }.items():
+        assert all(word in shown[name] for word in words), name
     assert {d.figure.name: d.without for d in drawn}["11-handovers"] == ("walker/symmetric",)
     (again,) = draw_figures(results.Results(study), find_figures(["7"]), tmp_path / "twice")
     assert [path.read_bytes() for path in again.files] == [path.read_bytes() for path in drawn[1].files]
@@ -491,8 +597,9 @@ def test_every_figure_is_drawn_where_there_is_nothing_yet(study, tmp_path):
     assert numbers == list(range(1, len(FIGURES) + 1))
     assert [figure.paper for figure in FIGURES[:10]] == [f"Figure {i}" for i in range(1, 11)]
     few = [figure for figure in FIGURES if figure.name in ("05-maze-reward", "12-switching", "14-regulariser-length")]
-    drawn = draw_figures(results.Results(study), few, tmp_path)
-    assert drawn[0].without == drawn[0].figure.rows
+    for one in draw_figures(results.Results(study), few, tmp_path):
+        assert one.without == one.figure.rows
+        assert "no finished" in one.files[1].read_text(), one.figure.name
 
 
 def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(study, tmp_path, monkeypatch):
@@ -504,23 +611,25 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
     text, page = (path.read_text() for path in pages)
     for words in (
         "## Claims",
-        "### Each claim in each setting",
+        "* **Undecided, too few seeds**: 4, 5, 6, 10, 11, 12",
+        "## Each claim in each setting",
         "## The paper, in its order",
         "### What the paper leaves open, and what we took",
         "entropy bonus 0.02",
-        "walker/plain 2 of 10, walker/random-start 3 of 10",
-        "ablation/maze/k/10, ",  # rows that nobody has run are named
-        "light/walker/plain, ",
+        "2 of 10: walker/plain; 3 of 10: walker/{random-start,",
+        "ablation/maze/k/{10,20,100,200,400}",  # rows that nobody has run are named
+        "light/walker/{plain,",
+        "footwork reproduce --rows walker/plain --seeds 2",
         "## Figures",
         "## Rows",
         "seed-2 is not finished",
-        "mujoco",
     ):
-        assert words in text
+        assert words in text, words
     assert text.index("## Claims") < text.index("## The paper") < text.index("## Figures")
     assert not re.search(r'(src|href)="(?!data:)', page)  # nothing but what is in the page itself
     assert page.count("data:image/png;base64,") == 2
-    assert all(f"| {claim.number} |" in text for claim in claims.CLAIMS)
+    assert all(f"| {claim.number} | {claim.words}" in text for claim in claims.CLAIMS)
+    assert '<b class="undecided">undecided</b>' in page
     kept = Study(tmp_path / "report/results")
     assert not list(kept.runs.rglob("metrics.jsonl"))
     again = claims.judge_all(results.Results(kept))
@@ -530,17 +639,41 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
             assert a.effect is b.effect is None or a.effect == pytest.approx(b.effect, rel=1e-3)
 
 
+def test_the_readme_shows_the_claims_as_the_report_does():
+    """Copied line by line, so that neither can say what the other does not."""
+    root = Path(__file__).parents[1]
+    readme, said = ((root / name).read_text().splitlines() for name in ("README.md", "report/REPORT.md"))
+    section = readme[readme.index("## The study so far") :]
+    shown = [line for line in section[: section.index("## What you can do")] if line.startswith("| ")]
+    assert len(shown) > 3
+    assert not [line for line in shown if line not in said]
+
+
 def test_figures_of_which_there_is_one_are_not_drawn_under_another_ant(study, tmp_path):
     fill(study, ("light/walker/plain", "light/maze/hrl/interleaved"), 1)
     drawn = draw_figures(results.Results(study), find_figures(["12", "13", "14", "20"]), tmp_path, "light/")
     assert [one.figure.name for one in drawn] == ["12-switching"]
 
 
-def test_legends_say_how_many_seeds(study):
+def test_panels_say_how_many_seeds(study):
     fill(study, ("maze/paper/plain",), 2)
     fill(study, ("maze/hrl/plain",), 1)
-    rows = ("maze/paper/plain", "maze/hrl/plain", "maze/flat/free")
-    assert style.labels_of(results.Results(study), rows) == dict.fromkeys(rows[:2], "plain (n = 2, 1)")
+    found = results.Results(study)
+    assert style.seeds_of(found, ("maze/paper/plain", "maze/flat/free")) == "2 seeds"
+    assert style.seeds_of(found, ("maze/paper/plain", "maze/hrl/plain")) == "1 to 2 seeds"
+    assert style.seeds_of(found, ("maze/hrl/plain",)) == "1 seed"
+    assert style.seeds_of(found, ("maze/flat/free",)) == ""
+
+
+def test_logarithmic_axes_are_as_long_as_the_runs(study, tmp_path):
+    """A quick study's curves, of some 20,000 steps, fill their panels."""
+    quick = Study(study.runs, QUICK)
+    for row in ("bandit/hrl/appropriate-bias", "bandit/flat/free"):
+        fake_run(quick, row, 0, size=QUICK)
+    (drawn,) = draw_figures(results.Results(quick), find_figures(["6"]), tmp_path)
+    text = drawn.files[1].read_text()
+    assert ">10 k<" in text
+    assert ">10 M<" not in text
 
 
 def test_answers_name_claims_and_figures_that_exist():
@@ -555,9 +688,9 @@ def test_an_answer_shows_its_rows_and_names_those_that_have_no_runs(study):
     found = results.Results(study)
     sentence = next(answer for answer in answers.ANSWERS if answer.section == "3.4")
     speed, handover = answers.said(sentence, claims.judge_all(found), found).splitlines()[1:]
-    mean = results.METRICS["speed"].show(float(iqm(found.scores("walker/plain", "speed"))))
-    assert f"walker/plain: {mean} (3 seeds); no runs of light/walker/plain, bullet/walker/plain" in speed
-    assert handover.startswith(results.METRICS["handover"].words)
+    mean = METRICS["speed"].show(float(iqm(found.scores("walker/plain", "speed"))))
+    assert f"walker/plain {mean} (3 seeds); no runs of light/walker/plain bullet/walker/plain" in speed
+    assert handover.startswith(METRICS["handover"].words)
 
 
 def test_one_seed_has_no_interval(study):

@@ -154,6 +154,16 @@ def performance_profile(scores: npt.ArrayLike, thresholds: npt.ArrayLike) -> Flo
     return np.asarray((values[:, None] > np.asarray(thresholds, np.float64)[None]).mean(axis=0))
 
 
+def profile_band(
+    scores: npt.ArrayLike, thresholds: npt.ArrayLike, generator: np.random.Generator, draws: int = DRAWS
+) -> tuple[Floats, Floats]:
+    """Performance profile of runs [S] or [S, T] at each threshold [X], and its interval [2, X]; seeds drawn whole."""
+    values, at = as_scores(scores), np.asarray(thresholds, np.float64)
+    above = (values[:, :, None] > at).mean(axis=1)  # [S, X]
+    samples = above[draw_seeds(len(values), draws, generator)].mean(axis=1)
+    return performance_profile(values, at), percentile_interval(samples)
+
+
 def curve_band(curves: npt.ArrayLike, generator: np.random.Generator, draws: int = DRAWS) -> tuple[Floats, Floats]:
     """IQM over seeds of curves [S, X] and its interval [2, X]; a curve is drawn whole."""
     values = np.asarray(curves, np.float64)
@@ -226,6 +236,7 @@ __all__ = [
     "percentile_interval",
     "performance_profile",
     "probability_of_improvement",
+    "profile_band",
     "rate_over_seeds",
     "spread",
     "wilson",

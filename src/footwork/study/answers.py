@@ -9,10 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from footwork.learn.config import PAPER
 from footwork.statistics import iqm
-from footwork.study.claims import Judgement, show_effect
-from footwork.study.experiments import GRIDS, find_row, is_row
-from footwork.study.results import METRICS, Results, seeds_in_words
+from footwork.study.claims import PAPER_REGULARISERS, Judgement, show_effect
+from footwork.study.experiments import GRIDS, in_braces, is_row
+from footwork.study.metrics import METRICS
+from footwork.study.plan import Study
+from footwork.study.results import Results, seeds_in_words
 
 
 @dataclass(frozen=True)
@@ -64,13 +67,14 @@ def _rows(metric: str, *rows: str) -> Shown:
     return Shown(metric, tuple((row, row) for row in rows))
 
 
-_LENGTHS = tuple(f"ablation/{kind}/t" for kind in ("random-start", "random-repeated", "appropriate-bias"))
+_LENGTHS = tuple(f"ablation/{kind}/t" for kind in PAPER_REGULARISERS)
 
 ANSWERS: tuple[Answer, ...] = (
     Answer(
         "abstract, 1",
         "Without resetting joints, the hierarchy navigates to a given goal; the flat policies fail",
-        figures=(15, 16),
+        (1, 2),
+        (15, 16),
         shows=tuple(
             _rows(
                 "success",
@@ -82,6 +86,19 @@ ANSWERS: tuple[Answer, ...] = (
         built="no joint is reset but at the start of an episode",
     ),
     Answer(
+        "abstract, 9",
+        "The regularisers produce significantly better performing hierarchies",
+        (7, 8),
+        (9, 10, 15),
+    ),
+    Answer(
+        "1",
+        "Four sub-policies are trained separately",
+        built="as described: four learners with nothing in common but the machine. Ours are not: interleaved ones "
+        "train together, a symmetric one is a single policy in four frames",
+    ),
+    Answer("2", "PPO-Penalty and PPO-Clip", built="both are there; every row of the study clips, as section 7 says"),
+    Answer(
         "3.1",
         "AntWalker: four directions, targets 10 km away; 32 observations, 8 torques (Figure 1)",
         figures=(1,),
@@ -90,9 +107,10 @@ ANSWERS: tuple[Answer, ...] = (
     ),
     Answer(
         "3.2",
-        "AntBandit: one of the four corners of a square; 36 observations (Figure 2)",
-        figures=(2,),
-        built="as described",
+        "AntBandit: one of the four corners of a square, drawn at each reset; 36 observations; with and without the "
+        "stability penalties (Figure 2)",
+        figures=(2, 20),
+        built="as described; with penalties: rows ...-penalised",
     ),
     Answer(
         "3.3",
@@ -122,9 +140,26 @@ ANSWERS: tuple[Answer, ...] = (
         built="k = 50, and a grid around it",
     ),
     Answer(
+        "4",
+        "Sub-policies see the observation without what the task adds; the master sees all of it",
+        figures=(4,),
+        built="as described: the first 32 numbers",
+    ),
+    Answer(
+        "4",
+        "The master's reward is the sum of the rewards over the k steps",
+        built="as described, undiscounted within an option; Table 1's discount applies once per decision",
+    ),
+    Answer(
         "4, 5",
         "Mean and variance of the actions are learned functions of the state; two tanh layers of 64",
         built="as described, for actors and critics",
+    ),
+    Answer(
+        "5",
+        "Flat policies see the whole observation, with and without the stability penalties",
+        figures=(5, 6),
+        built="as described: rows flat/free and flat/penalised",
     ),
     Answer("6", "The agent consistently fails to transition to an orthogonal policy", (12,), (11,)),
     Answer(
@@ -135,6 +170,18 @@ ANSWERS: tuple[Answer, ...] = (
     ),
     Answer("6", "Appropriate bias seems to work best", (10,), (11, 12)),
     Answer("6", "Transitions take place successfully almost always", (11,), (11,)),
+    Answer(
+        "7",
+        "With and without regularisation: four sub-policies, masters on AntMaze and AntBandit, two flat policies on "
+        "each; PPO with a clipped surrogate, GAE, Adam",
+        built="as described; every row, its seeds and its steps under Rows",
+    ),
+    Answer(
+        "7",
+        "Table 1: learning rate, discount, GAE, clip ratio, value loss, I",
+        built=f"learning rate {PAPER.learning_rate:g}, discount {PAPER.gamma:g}, GAE {PAPER.gae_lambda:g}, clip ratio "
+        f"{PAPER.clip_eps:g}, value loss {PAPER.vf_coef:g}, I = {PAPER.update_epochs}, in every row of the paper's",
+    ),
     Answer(
         "7",
         "S, I, B of Tables 1 and 2; create B = 32 batches (a number, or a size?)",
@@ -149,7 +196,13 @@ ANSWERS: tuple[Answer, ...] = (
         "7",
         "The reward is averaged over consecutive runs to get a cleaner plot",
         figures=(5, 6, 9, 10),
-        built="so here",
+        built="so here, over the last twentieth of the training",
+    ),
+    Answer(
+        "8",
+        "Only the reward for the distance is graphed, also where penalties are in it",
+        figures=(5, 6, 9, 10, 20),
+        built="so here; verdicts rest on the distance too, success and the way around the walls stand beside it",
     ),
     Answer("8", "Stability penalties while training the master do not make a difference", (13,), (20,)),
     Answer("8", "The regularised hierarchy outperforms the flat policies (Figures 5, 6)", (1, 2), (5, 6, 15, 18)),
@@ -160,9 +213,32 @@ ANSWERS: tuple[Answer, ...] = (
         built="flat policies see what masters see and take 10 M control steps; a master takes 0.5 or 2 M on "
         "sub-policies of 4 to 8 M. With the masters' reward (flat/guided-...) they are shown too",
     ),
+    Answer(
+        "8, 9",
+        "The search space of a master is much smaller, one action of it changes the state by a large amount",
+        figures=(13, 15),
+        built="four choices every k steps for eight torques every step; how much k matters is Figure 13",
+    ),
     Answer("8", "Flat policies without stability penalties perform better than with them", (3,), (5, 6)),
-    Answer("8", "Unregularised sub-policies show a considerably smaller variance (Figures 7, 8)", (6,), (7, 8)),
-    Answer("8", "Unregularised policies achieve higher rewards eventually", (5,), (7, 8)),
+    Answer(
+        "8",
+        "Unregularised sub-policies show a considerably smaller variance (Figures 7, 8), because regularisation takes "
+        "random steps",
+        (6,),
+        (7, 8),
+    ),
+    Answer(
+        "8",
+        "Unregularised policies achieve higher rewards eventually",
+        (5,),
+        (7, 8),
+        shows=tuple(
+            _rows(metric, *(f"walker/{kind}" for kind in ("plain", *PAPER_REGULARISERS)))
+            for metric in ("return halfway", "return")
+        ),
+        built="what is found depends on when one looks, since returns need not keep rising under Table 1's constant "
+        "learning rate: claims 5 and 6 are shown half-way through training too",
+    ),
     Answer("8", "... but do not allow smooth transitions", (12,), (11, 12)),
     Answer("8", "Regularised sub-policies serve as much better slaves (Figures 9, 10)", (7, 8), (9, 10, 16)),
     Answer("8", "The difference is much more pronounced on AntMaze", (9,), (9, 10)),
@@ -188,15 +264,15 @@ class Choice:
     here: str
 
 
-def _choices() -> tuple[Choice, ...]:
-    """Read off the rows themselves."""
+def choices(study: Study) -> tuple[Choice, ...]:
+    """Read off the rows themselves, as the study trains them."""
 
     def fields(kind: str) -> dict[str, Any]:
-        return vars(find_row(f"walker/{kind}").regulariser)
+        return vars(study.row(f"walker/{kind}").regulariser)
 
-    walker, annealed = find_row("walker/plain"), find_row("walker/interleaved").ppo
-    maze, bandit = find_row("maze/paper/plain"), find_row("bandit/paper/plain")
-    ours, flat = find_row("maze/hrl/plain"), find_row("maze/flat/free")
+    walker, annealed = study.row("walker/plain"), study.row("walker/interleaved").ppo
+    maze, bandit = study.row("maze/paper/plain"), study.row("bandit/paper/plain")
+    ours, flat = study.row("maze/hrl/plain"), study.row("maze/flat/free")
     table_1, masters = walker.ppo, ours.ppo
     weights = walker.task.weights
     corner, start = bandit.task.arena.goals[0], maze.task.arena.start
@@ -205,7 +281,7 @@ def _choices() -> tuple[Choice, ...]:
         Choice(
             "control steps",
             f"sub-policies {walker.total_steps:,} per direction (symmetric ones "
-            f"{find_row('walker/symmetric').total_steps:,}), masters {bandit.total_steps:,} on AntBandit and "
+            f"{study.row('walker/symmetric').total_steps:,}), masters {bandit.total_steps:,} on AntBandit and "
             f"{maze.total_steps:,} on AntMaze, flat policies {flat.total_steps:,}",
         ),
         Choice(
@@ -258,9 +334,6 @@ def _choices() -> tuple[Choice, ...]:
     )
 
 
-CHOICES: tuple[Choice, ...] = _choices()
-
-
 def said(answer: Answer, judgements: Sequence[Judgement], results: Results) -> str:
     """The answer in lines: how it is built, the verdicts with their effects, the rows that are shown."""
     lines = [answer.built] if answer.built else []
@@ -280,16 +353,18 @@ def _verdict(judgement: Judgement) -> str:
 def _side_by_side(shown: Shown, results: Results) -> str:
     """The rows that have runs; those without are named together."""
     metric, grid = METRICS[shown.metric], f"{shown.where}, " if shown.where else ""
-    measured, missing = [], []
+    measured: list[str] = []
+    missing: list[tuple[str, str]] = []
     for label, row in shown.rows:
         scores = results.scores(row, shown.metric) if is_row(row) else ()
         if len(scores):
-            measured.append(f"{label}: {metric.show(float(iqm(scores)))} ({seeds_in_words(len(scores))})")
+            measured.append(f"{label} {metric.show(float(iqm(scores)))} ({seeds_in_words(len(scores))})")
         else:
-            missing.append(label)
+            missing.append((label, row))
     parts = [", ".join(measured)] if measured else []
-    parts += [f"no runs of {', '.join(missing)}" if measured or not grid else "no runs"] if missing else []
+    names = ", ".join(label for label, _ in missing) if grid else in_braces(row for _, row in missing)
+    parts += [f"no runs of {names}" if measured or not grid else "no runs"] if missing else []
     return f"{grid}{metric.words}: {'; '.join(parts)}"
 
 
-__all__ = ["ANSWERS", "CHOICES", "Answer", "Choice", "Shown", "said"]
+__all__ = ["ANSWERS", "Answer", "Choice", "Shown", "choices", "said"]

@@ -24,9 +24,9 @@ reward and schedule, the paper's or ours. A verdict names all of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -34,14 +34,16 @@ from footwork.statistics import (
     Effect,
     Floats,
     Statistic,
+    as_scores,
     contrast,
     generator_for,
     overall_iqm,
     probability_of_improvement,
     spread,
 )
-from footwork.study.experiments import MAIN, SCHEDULES, find_row, is_row
-from footwork.study.results import METRICS, Results, seeds_in_words
+from footwork.study.experiments import MAIN, SCHEDULES, find_row, in_braces, is_row
+from footwork.study.metrics import METRICS
+from footwork.study.results import Results, seeds_in_words
 
 Rule = Literal["greater", "not worse", "same", "at least", "at most"]
 Verdict = Literal["holds", "does not hold", "undecided"]
@@ -118,6 +120,8 @@ class Finding:
     probability: float | None  # of improvement, of two rows
     verdict: Verdict
     so_far: Verdict  # what the rule says if the number of seeds is not asked for
+    room: float | None = None  # the most that a difference of shares could be: what the other row leaves
+    apart: Effect | None = None  # of rows whose seeds were drawn together: as if they were independent
 
 
 @dataclass(frozen=True)
@@ -158,6 +162,14 @@ def _shown_too(contrasts: tuple[Contrast, ...]) -> tuple[Contrast, ...]:
             shown.append(replace(c, words=f"{c.words}, {_SHORT[metric]}", metric=metric, decides=False))
     return (*contrasts, *shown)
 
+
+# All returns fall in the second half of the training: what would have been found at half of it, shown.
+_HALFWAY = ", half-way through training"
+
+# One hand-over from walking, which decides, is near its ceiling; shown beside it, one after the other for 33 s.
+_HANDING_OVER = (("handover", ""), ("moving", ", switched at random"))
+
+_GAPS = (("maze", "appropriate-bias"), ("maze", "plain"), ("bandit", "appropriate-bias"), ("bandit", "plain"))
 
 _SHORT = {"success": "success", "route": "way around the walls"}
 
@@ -218,6 +230,7 @@ CLAIMS: tuple[Claim, ...] = (
             Contrast(
                 "within 0.5 m of the start", ("maze/flat/free",), (1,), "at the start", "at most", 0.5, decides=False
             ),
+            Contrast("turned over", ("maze/flat/free",), (1,), "turned over", "at most", 0.5, decides=False),
         ),
     ),
     Claim(
@@ -225,7 +238,9 @@ CLAIMS: tuple[Claim, ...] = (
         "Unregularised sub-policies reach a higher training reward than regularised ones.",
         "8, Figures 7 and 8",
         tuple(
-            _greater(f"against {kind}", "walker/plain", f"walker/{kind}", "return", 50.0) for kind in PAPER_REGULARISERS
+            _greater(f"against {kind}{when}", "walker/plain", f"walker/{kind}", metric, 50.0, decides=not when)
+            for metric, when in (("return", ""), ("return halfway", _HALFWAY))
+            for kind in PAPER_REGULARISERS
         ),
     ),
     Claim(
@@ -236,14 +251,16 @@ CLAIMS: tuple[Claim, ...] = (
         (
             *(
                 Contrast(
-                    f"{kind} less plain",
+                    f"{kind} less plain{when}",
                     (f"walker/{kind}", "walker/plain"),
                     (1, -1),
-                    "return by direction",
+                    metric,
                     "greater",
                     50.0,
                     "spread",
+                    decides=not when,
                 )
+                for metric, when in (("return by direction", ""), ("return by direction halfway", _HALFWAY))
                 for kind in PAPER_REGULARISERS
             ),
             # The other reading, of one curve: how much it goes up and down. Added after the first seeds were seen.
@@ -278,34 +295,17 @@ CLAIMS: tuple[Claim, ...] = (
         9,
         "The gap between regularised and unregularised sub-policies is larger on AntMaze than on AntBandit.",
         "8, Figures 9 and 10",
-        (
+        tuple(
             Contrast(
-                "gap on AntMaze less gap on AntBandit",
-                (
-                    "maze/{schedule}/appropriate-bias",
-                    "maze/{schedule}/plain",
-                    "bandit/{schedule}/appropriate-bias",
-                    "bandit/{schedule}/plain",
-                ),
+                f"gap on AntMaze less gap on AntBandit{how}",
+                tuple(f"{place}/{{schedule}}/{kind}" for place, kind in _GAPS),
                 (1, -1, -1, 1),
-                "way",
+                metric,
                 "greater",
                 0.05,
-            ),
-            Contrast(
-                "gap on AntMaze less gap on AntBandit, success",
-                (
-                    "maze/{schedule}/appropriate-bias",
-                    "maze/{schedule}/plain",
-                    "bandit/{schedule}/appropriate-bias",
-                    "bandit/{schedule}/plain",
-                ),
-                (1, -1, -1, 1),
-                "success",
-                "greater",
-                0.05,
-                decides=False,
-            ),
+                decides=not how,
+            )
+            for metric, how in (("way", ""), ("success", ", success"))
         ),
         everywhere=True,
     ),
@@ -314,7 +314,8 @@ CLAIMS: tuple[Claim, ...] = (
         "Appropriate bias is the best of the paper's three regularisers at handing over.",
         "6",
         tuple(
-            _greater(f"against {kind}", "walker/appropriate-bias", f"walker/{kind}", "handover", 0.05)
+            _greater(f"against {kind}{how}", "walker/appropriate-bias", f"walker/{kind}", metric, 0.05, not how)
+            for metric, how in _HANDING_OVER
             for kind in PAPER_REGULARISERS[:2]
         ),
         everywhere=True,
@@ -324,7 +325,18 @@ CLAIMS: tuple[Claim, ...] = (
         "With appropriate bias transitions succeed almost always: in at least 95 % of orthogonal hand-overs the ant "
         "neither falls nor flips and walks on at 0.5 m/s or more.",
         "6",
-        (Contrast("share of hand-overs", ("walker/appropriate-bias",), (1,), "handover", "at least", 0.95),),
+        tuple(
+            Contrast(
+                f"share{how or ' of hand-overs'}",
+                ("walker/appropriate-bias",),
+                (1,),
+                metric,
+                "at least",
+                0.95,
+                decides=not how,
+            )
+            for metric, how in _HANDING_OVER
+        ),
         everywhere=True,
     ),
     Claim(
@@ -332,7 +344,12 @@ CLAIMS: tuple[Claim, ...] = (
         "Unregularised ants consistently fail to hand over to an orthogonal policy: at most half of the hand-overs "
         "succeed.",
         "6",
-        (Contrast("share of hand-overs", ("walker/plain",), (1,), "handover", "at most", 0.5),),
+        tuple(
+            Contrast(
+                f"share{how or ' of hand-overs'}", ("walker/plain",), (1,), metric, "at most", 0.5, decides=not how
+            )
+            for metric, how in _HANDING_OVER
+        ),
         everywhere=True,
     ),
     Claim(
@@ -360,7 +377,10 @@ CLAIMS: tuple[Claim, ...] = (
         "ours",
         (
             *(
-                _greater(f"hand-overs, against {kind}", "walker/interleaved", f"walker/{kind}", "handover", 0.05)
+                _greater(
+                    f"hand-overs, against {kind}{how}", "walker/interleaved", f"walker/{kind}", metric, 0.05, not how
+                )
+                for metric, how in _HANDING_OVER
                 for kind in PAPER_REGULARISERS
             ),
             *_shown_too(
@@ -429,14 +449,11 @@ def rows_read(prefixes: Iterable[str] = ("",)) -> list[str]:
 
 
 def prefixes_at_hand(results: Results) -> tuple[str, ...]:
-    """The default engine and ant, and those others that have finished sub-policies in the study's folder."""
-    places = sorted(path for path in results.study.runs.glob("*/walker") if any(path.glob("*/*/DONE")))
-    found = []
-    for path in places:
-        prefix = f"{path.parent.name}/"
-        if any(is_row(prefix + row) for row in MAIN):
-            found.append(prefix)
-    return ("", *found)
+    """The default engine and ant, and those others that have finished runs in the study's folder."""
+    runs = results.study.runs
+    places = sorted(path.name for path in runs.iterdir() if path.is_dir()) if runs.is_dir() else []
+    there = [f"{name}/" for name in places if any(is_row(f"{name}/{row}") for row in MAIN)]
+    return ("", *(prefix for prefix in there if any((runs / prefix).rglob("DONE"))))
 
 
 def judge_all(results: Results) -> list[Judgement]:
@@ -463,22 +480,47 @@ def _overall(verdicts: list[Verdict]) -> Verdict:
 def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> Finding:
     rows = tuple(setting.fill(row) for row in what.rows)
     by_seed = [results.scores_by_seed(row, what.metric) if is_row(row) else {} for row in rows]
+    stands_on = [_stands_on(row) if is_row(row) else row for row in rows]
+    by_seed = _in_pairs(results, rows, stands_on, by_seed)
     scores = [np.array(list(score.values()), np.float64) for score in by_seed]
     seeds = tuple(len(score) for score in scores)
     if not all(seeds):
         return Finding(what, rows, seeds, None, None, "undecided", "undecided")
     statistic: Statistic = spread if what.statistic == "spread" else overall_iqm
     generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
-    units = [[(_trained(row), seed) for seed in score] for row, score in zip(rows, by_seed, strict=True)]
+    units = [[(row, seed) for seed in score] for row, score in zip(stands_on, by_seed, strict=True)]
     effect = contrast(scores, what.weights, generator, statistic, units=units)
+    together = len(set(stands_on)) < len(rows)
+    apart = contrast(scores, what.weights, generator, statistic) if together else None
     so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"
     verdict = so_far if min(seeds) >= claim.min_seeds else "undecided"
-    return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far)
+    room = None
+    if METRICS[what.metric].is_share and what.rule == "greater" and what.weights == (1, -1):
+        room = 1.0 - float(overall_iqm(as_scores(scores[1])))
+    return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far, room, apart)
 
 
-def _trained(row: str) -> str:
+def _stands_on(row: str) -> str:
     """The row whose runs a row's seeds stand on: a master's sub-policies, anything else's own."""
     return find_row(row).sub_policies or row
+
+
+def _in_pairs(
+    results: Results, rows: Sequence[str], stands_on: Sequence[str], by_seed: Sequence[dict[int, Any]]
+) -> list[dict[int, Any]]:
+    """Of rows that stand on the same runs and have different seeds, those that all of them have; the others are named.
+
+    Where one has none at all there is nothing to compare, and nothing to say.
+    """
+    paired = []
+    for row, base, scores in zip(rows, stands_on, by_seed, strict=True):
+        partners = [other for other, b in zip(by_seed, stands_on, strict=True) if b == base and other]
+        alone = sorted(seed for seed in scores if not all(seed in other for other in partners))
+        if alone:
+            seeds = ", ".join(map(str, alone))
+            results.problems[f"{row}: seeds without a counterpart are left out of paired comparisons: {seeds}"] = None
+        paired.append({seed: score for seed, score in scores.items() if seed not in alone})
+    return paired
 
 
 def _probability(what: Contrast, scores: list[Floats]) -> float | None:
@@ -507,25 +549,50 @@ def decide(rule: Rule, bound: float, effect: Effect) -> Verdict:
 
 def _where(claim: Claim, setting: Setting) -> str:
     experiment = find_row(f"{setting.prefix}walker/plain")
-    engine = getattr(experiment, "engine", "mujoco")
-    where = f"{engine}, {experiment.task.robot.name} ant"
+    where = f"{experiment.engine}, {experiment.task.robot.name} ant"
     return f"{where}, {SCHEDULES[setting.schedule]}" if len(settings_of(claim)) > 1 else where
 
 
 def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
     """One phrase that says what the verdict rests on, or what is missing."""
+    missing = in_braces(dict.fromkeys(row for f in deciding for row, n in zip(f.rows, f.seeds, strict=True) if n == 0))
     if verdict != "undecided":
-        turned = [f.contrast.words for f in deciding if f.verdict == "does not hold" and is_reversed(f)]
-        said = f"; the other way round: {', '.join(turned)}" if turned else ""
-        return f"{seeds_in_words(min(min(f.seeds) for f in deciding))} or more on every side{said}"
-    missing = [row for f in deciding for row, n in zip(f.rows, f.seeds, strict=True) if n == 0]
+        decisive = [f for f in deciding if f.verdict == verdict]
+        said = [f"{seeds_in_words(min(min(f.seeds) for f in decisive))} or more on every side"]
+        turned = [f.contrast.words for f in decisive if is_reversed(f)]
+        said += [f"the other way round: {', '.join(turned)}"] if turned else []
+        said += [f"no runs of {missing}"] if missing else []
+        return "; ".join([*said, *_no_room(deciding), *_drawn_apart(deciding)])
     if missing:
-        return f"no runs of {', '.join(dict.fromkeys(missing))}"
+        return f"no runs of {missing}"
     fewest = min(min(f.seeds) for f in deciding)
     if fewest < claim.min_seeds:
         so_far = _overall([f.so_far for f in deciding])
         return f"{seeds_in_words(fewest)}, {claim.min_seeds} are asked for; so far: {so_far}"
-    return "the interval allows both"
+    return "; ".join(["the interval allows both", *_no_room(deciding), *_drawn_apart(deciding)])
+
+
+def _no_room(deciding: list[Finding]) -> list[str]:
+    """Comparisons in which the other row leaves less than the smallest difference that matters."""
+    return [
+        f"{f.contrast.words}, no more than {100 * f.room:.1f} points were possible"
+        for f in deciding
+        if f.room is not None and f.room < f.contrast.bound
+    ]
+
+
+def _drawn_apart(deciding: list[Finding]) -> list[str]:
+    """Comparisons of masters on the same sub-policies that would be decided otherwise if they were independent."""
+    return [
+        f"{f.contrast.words} with seeds drawn apart {_in_brackets(f, f.apart)}: {otherwise}"
+        for f in deciding
+        if f.apart is not None and (otherwise := decide(f.contrast.rule, f.contrast.bound, f.apart)) != f.so_far
+    ]
+
+
+def _in_brackets(finding: Finding, effect: Effect) -> str:
+    low, high = (METRICS[finding.contrast.metric].number(value) for value in (effect.low, effect.high))
+    return f"[{low}, {high}]"
 
 
 def is_reversed(finding: Finding) -> bool:
@@ -534,14 +601,29 @@ def is_reversed(finding: Finding) -> bool:
 
 
 def show_effect(finding: Finding) -> str:
-    """The effect with its interval, in the metric's unit; one seed has no interval, and no spread."""
+    """The effect with its interval and unit; one seed has no interval, and no spread."""
     if finding.effect is None:
         return "-"
-    percent, alone = METRICS[finding.contrast.metric].percent, min(finding.seeds) == 1
+    metric, alone = METRICS[finding.contrast.metric], min(finding.seeds) == 1
     if alone and finding.contrast.statistic == "spread":
         return "-"
-    shown = [f"{100 * value:.1f}" if percent else f"{value:.4g}" for value in finding.effect]
-    return shown[0] + ("" if alone else f" [{shown[1]}, {shown[2]}]") + (" %" if percent else "")
+    interval = "" if alone else f" {_in_brackets(finding, finding.effect)}"
+    unit = metric.unit if len(finding.rows) == 1 else metric.difference
+    return f"{metric.number(finding.effect.estimate)}{interval} {unit}"
+
+
+def show_bound(what: Contrast) -> str:
+    """The rule, and the smallest difference that matters or the threshold."""
+    metric = METRICS[what.metric]
+    return f"{what.rule}, {metric.number(what.bound)} {metric.unit if len(what.rows) == 1 else metric.difference}"
+
+
+def show_chance(finding: Finding) -> str:
+    """The probability of improvement; of spreads, that a run is farther from the middle of its row."""
+    if finding.probability is None:
+        return "-"
+    farther = " farther from the middle" if finding.contrast.statistic == "spread" else ""
+    return f"{finding.probability:.2f}{farther}"
 
 
 __all__ = [
@@ -559,5 +641,7 @@ __all__ = [
     "prefixes_at_hand",
     "rows_read",
     "settings_of",
+    "show_bound",
+    "show_chance",
     "show_effect",
 ]

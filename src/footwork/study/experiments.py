@@ -280,12 +280,12 @@ def group_of(name: str) -> str:
     return name.rpartition("/")[0]
 
 
-def _all_rows() -> str:
-    """Every row's address, those of a group in braces."""
+def in_braces(names: Iterable[str]) -> str:
+    """Addresses in a line, those of a group in braces, as a shell takes them."""
     groups: dict[str, list[str]] = {}
-    for name in EXPERIMENTS:
+    for name in names:
         groups.setdefault(group_of(name), []).append(name.rpartition("/")[2])
-    return ", ".join(f"{group}/{{{', '.join(names)}}}" for group, names in groups.items())
+    return " ".join(f"{g}/{{{','.join(last)}}}" if len(last) > 1 else f"{g}/{last[0]}" for g, last in groups.items())
 
 
 def match_rows(patterns: Iterable[str]) -> list[str]:
@@ -329,7 +329,7 @@ def find_row(name: str) -> Experiment:
     if first in ENGINES and rest in EXPERIMENTS:
         return with_engine(EXPERIMENTS[rest], first)
     if name not in EXPERIMENTS:
-        raise ValueError(f"unknown row {name!r}; known rows: {_all_rows()}")
+        raise ValueError(f"unknown row {name!r}; known rows: {in_braces(EXPERIMENTS)}")
     return EXPERIMENTS[name]
 
 

@@ -20,8 +20,9 @@ from footwork import checkpoint
 from footwork.record import RunDir, RunError, RunInUse, config_to_json
 from footwork.study.measure import measure, measured
 from footwork.study.plan import Job, Size, Study
-from footwork.study.results import find_samples, read_curve
+from footwork.study.results import find_samples
 from footwork.study.runs import NEEDED, load_run, one_seed, run_path, train_row
+from footwork.study.training_curves import read_curve
 from footwork.train import Experiment, Interrupted, TrainingDiverged, policy_meta
 
 WAIT_FOR_LOCK = 120.0  # s; a run whose last process was killed may still be saving

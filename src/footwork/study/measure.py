@@ -30,9 +30,6 @@ EVALUATION_SEED = 1_000_003  # of the episodes; the run's seed is added
 STUCK_WITHIN = 1.0  # m around the point where the straight line to the goal meets a wall
 KEPT_PATHS = 12  # episodes per seed whose paths are kept
 _KEPT_POINTS = 100  # of a path, at most
-_OF_WALKERS = ("seed", "speed_mps", "fall_rate", "flip_rate")
-_OF_TASKS = ("seed", "success", "way", "stuck", "ends", "paths", "fall_rate", "flip_rate")
-_OF_TRANSITIONS = ("seed", "handover", "switching")
 
 
 def files_of(experiment: Experiment) -> tuple[str, ...]:
@@ -62,19 +59,48 @@ def problem_with(run: RunDir, name: str, size: Size | None = None) -> str | None
         return f"{path} is of a policy {content.get('steps')} steps old, the run has {run.summary().get('steps')}"
     if size is not None and content.get("size") != size.name:
         return f"{path} is of the {content.get('size')} study, not of the {size.name} one"
-    return _lacks(path, content["by_seed"])
+    return _malformed(path, content["by_seed"])
 
 
-def _lacks(path: Path, entries: Any) -> str | None:
-    """What no entry of a file of measurements can do without, and one does."""
-    for entry in entries if isinstance(entries, list) else [None]:
-        if not isinstance(entry, dict):
-            return f"{path} is damaged: it holds no entries"
-        wanted = _OF_TRANSITIONS if path.name == TRANSITIONS else _OF_WALKERS if "speed_mps" in entry else _OF_TASKS
-        missing = [name for name in wanted if name not in entry]
-        if missing:
-            return f"{path} is of another version of footwork: it does not say {', '.join(missing)}"
+def _malformed(path: Path, entries: Any) -> str | None:
+    """What is wrong with the entries of a file of measurements: whatever claims and figures read must be there."""
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        return f"{path} is damaged: it holds no entries"
+    for entry in entries:
+        try:
+            (_read_transitions if path.name == TRANSITIONS else _read_evaluation)(entry)
+        except KeyError as missing:
+            return f"{path} is of another version of footwork: it does not say {missing.args[0]}"
+        except (TypeError, ValueError, AttributeError):
+            return f"{path} is damaged: not every number in it is one"
     return None
+
+
+def _read_evaluation(entry: dict[str, Any]) -> None:
+    numbers = [entry["fall_rate"], entry["flip_rate"], entry["seed"]]
+    if "speed_mps" in entry:
+        numbers += [entry["speed_mps"][name] for name in DIRECTIONS]
+    else:
+        numbers += [entry["way"], *(entry["success"][str(radius)] for radius in SUCCESS_RADII)]
+        numbers += [] if entry["stuck"] is None else [entry["stuck"]]
+        for place in (entry["ends"], *(path["xy"] for path in entry["paths"])):
+            if np.array(place, np.float64).shape[1:] != (2,):
+                raise ValueError("places are pairs of numbers")
+        numbers += [choice for path in entry["paths"] for choice in path["choices"]]
+    _all_finite(numbers)
+
+
+def _read_transitions(entry: dict[str, Any]) -> None:
+    cells = [[(cell["success"], cell["speed_mps"]) for cell in line] for line in entry["handover"]]
+    if np.array(cells, np.float64).shape != (len(DIRECTIONS), len(DIRECTIONS), 2):
+        raise ValueError("not every direction to every direction")
+    figures = [found[name] for found in entry["switching"].values() for name in ("speed_mps", "idle", "upside_down")]
+    _all_finite([entry["seed"], *figures, *(int(period) for period in entry["switching"])])
+
+
+def _all_finite(numbers: list[Any]) -> None:
+    if not np.isfinite(np.array(numbers, np.float64)).all():
+        raise ValueError("not finite")
 
 
 def measure(run: RunDir, size: Size, num_threads: int = 1) -> None:

@@ -12,7 +12,7 @@ import html
 import os
 import platform
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,17 +21,31 @@ import numpy as np
 import footwork
 from footwork import checkpoint
 from footwork.checkpoint import CheckpointError, write_atomically
+from footwork.evaluate import HANDOVER_AFTER, HANDOVER_SPEED, HANDOVER_STEPS, IDLE_SPEED, SWITCHING_STEPS
 from footwork.record import RunError, source_digest
 from footwork.statistics import iqm
-from footwork.study.answers import ANSWERS, CHOICES, said
-from footwork.study.claims import CLAIMS, Claim, Finding, Judgement, judge_all, prefixes_at_hand, rows_read, show_effect
-from footwork.study.experiments import EXPERIMENTS, SCHEDULES, find_row, is_row
-from footwork.study.figures import FIGURES, Drawn, draw_figures
+from footwork.study.answers import ANSWERS, choices, said
+from footwork.study.claims import (
+    CLAIMS,
+    Claim,
+    Finding,
+    Judgement,
+    judge_all,
+    prefixes_at_hand,
+    rows_read,
+    show_bound,
+    show_chance,
+    show_effect,
+)
+from footwork.study.experiments import EXPERIMENTS, SCHEDULES, find_row, in_braces, is_row
+from footwork.study.figures import FIGURES, Drawn, count_in_words, draw_figures
 from footwork.study.measure import EVALUATION, TRANSITIONS
-from footwork.study.plan import STUDY_FILE, default_rows, plan, read_machine
-from footwork.study.results import CURVE, METRICS, Results, Sample, copy_curve, seeds_in_words
+from footwork.study.metrics import METRICS, SWITCHED_EVERY
+from footwork.study.plan import STUDY_FILE, default_rows, plan, read_origin
+from footwork.study.results import Results, Sample, seeds_in_words
 from footwork.study.runs import read_actors
-from footwork.train import planned_steps
+from footwork.study.training_curves import CURVE, copy_curve
+from footwork.train import planned_steps, steps_per_iteration
 
 RESULTS = "results"  # folder of a report, with the small files of its runs
 WRITTEN = "WRITTEN_BY_FOOTWORK_REPORT"  # in that folder: the next report may replace it
@@ -53,6 +67,13 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Bullets:
+    """A list."""
+
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Code:
     """Commands."""
 
@@ -61,7 +82,7 @@ class Code:
 
 @dataclass(frozen=True)
 class TableBlock:
-    """A table; cells are plain text, lines in them separated by newlines."""
+    """A table; lines in cells are separated by newlines."""
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -69,12 +90,13 @@ class TableBlock:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure with its caption."""
+    """A figure with its caption, in which names in braces stand for facts."""
 
     drawn: Drawn
+    facts: Mapping[str, str]
 
 
-Block = Heading | Text | Code | TableBlock | Picture
+Block = Heading | Text | Bullets | Code | TableBlock | Picture
 
 
 def write_report(results: Results, to: Path, command: str) -> list[Path]:
@@ -107,46 +129,75 @@ def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> lis
     """The report, whatever it is to be written as."""
     judgements = judge_all(results)
     rows = [row for row in all_rows(results) if results.samples(row)]
-    blocks: list[Block] = [Heading(_title(results), 1), Text(_summary(results, judgements, rows))]
+    blocks: list[Block] = [Heading(_title(results), 1), *_summary(results, judgements, rows)]
     if results.study.size.short is not None:
         blocks.append(
             Text(
                 "**Quick study: runs of a few updates and few seeds. It shows that everything works, not what holds.**"
             )
         )
-    blocks += [Heading("Claims"), _overview_table(judgements), Text(_READING)]
-    blocks += [Heading("Each claim in each setting", 3), _claims_table(judgements)]
-    blocks += [Heading("Every comparison", 3), _comparisons_table(judgements)]
+    blocks += [Heading("Claims"), _overview_table(judgements), Heading("How to read this", 3), Bullets(_reading())]
     blocks += [Heading("The paper, in its order"), _answers_table(judgements, results)]
-    blocks += [Heading("What the paper leaves open, and what we took", 3), _choices_table()]
-    blocks += [Heading("Figures"), *[Picture(d) for d in drawn]]
-    blocks += [Heading("Rows"), _rows_table(results, rows), Text(_ROWS)]
+    blocks += [Heading("What the paper leaves open, and what we took", 3), _choices_table(results)]
+    blocks += [Heading("Figures"), *[Picture(d, _facts(results)) for d in drawn]]
+    blocks += [Heading("Rows"), _rows_table(results, rows), Text(_rows_read(results))]
+    blocks += [Heading("Each claim in each setting"), _claims_table(judgements)]
+    blocks += [Heading("Every comparison"), _comparisons_table(judgements)]
     made = _made(results, rows, command)  # reads files, and so may find problems with them
     blocks += [Heading("Left out, and why"), *_left_out(results, drawn)]
     blocks += [Heading("How this was made"), *made]
     return blocks
 
 
-_READING = (
-    "An effect is a difference of interquartile means over seeds (of shares: in percentage points) with its 95 % "
-    "stratified-bootstrap interval, whole seeds drawn within each row. P is the probability that a run of the first "
-    "row scores higher than one of the second. Rules, margins and the number of seeds asked for stood in "
-    "footwork/study/claims.py before the runs. Masters and flat policies are judged by the way: how much nearer to "
-    "the goal an episode ends than it began, along the straight line, as a share of the distance at the start. That "
-    "is the distance part of the paper's reward, which is what it plots; on AntMaze it calls an ant at the wall "
-    "nearer than one half-way around it, so success and the way around the walls stand beside it. Comparisons that "
-    "are only shown do not decide; most of them were added after the first seeds had been seen. Differences that were "
-    "to be at least the bound and are smaller, or of the other sign, do not hold. Masters that stand on the same "
-    "sub-policies are not independent: their seeds are drawn together, as in a paired comparison (claims 9 and 13; "
-    "decided before a penalised master was trained). Nothing is corrected for the number of comparisons. With 10 "
-    "seeds such an interval covers the truth 92 to 96 times in 100, with 3 under 80 times (normal scores, simulated)."
-)
-_ROWS = (
-    "Interquartile means over seeds. Control steps: of one run, all its directions counted. Minutes: of training, mean "
-    "over runs, one core each, without the measuring that follows (200 episodes, drawn from the policy and not its "
-    "mean, or the hand-over matrix and random switching). Way: along the straight line. One row with what it stands "
-    "on: `footwork reproduce --rows ROW`."
-)
+def _reading() -> tuple[str, ...]:
+    low, high = HANDOVER_AFTER
+    return (
+        "An effect is a difference of interquartile means over seeds with its 95 % stratified-bootstrap interval, "
+        "whole seeds drawn within each row; differences of shares are in percentage points. P is the probability that "
+        "a run of the first row scores higher than one of the second.",
+        "Rules, margins and the number of seeds asked for stood in footwork/study/claims.py before the runs. A "
+        "difference that was to be at least the margin and is smaller, or of the other sign, does not hold. "
+        "Comparisons that are only shown do not decide; most of them were added after the first seeds had been seen.",
+        "Way: how much nearer to the goal an episode ends than it began, along the straight line, as a share of the "
+        "distance at the start. That is the distance part of the paper's reward, which is what it plots, and what "
+        "masters and flat policies are judged by. On AntMaze it calls an ant at the wall nearer than one half-way "
+        "around it, so success and the way around the walls stand beside it.",
+        f"Hand-over: one sub-policy walks for {low} to {high} control steps, another takes over; it succeeds if the "
+        f"ant neither falls nor turns over in the {HANDOVER_STEPS} steps that follow and is moved on at "
+        f"{HANDOVER_SPEED} m/s or more, over all of them and along the second direction. Orthogonal ones count: eight "
+        "of sixteen pairs. One hand-over from walking is easier than one after the other: under random switching for "
+        f"{SWITCHING_STEPS} steps, shown beside it, a direction is drawn from all four every {SWITCHED_EVERY} steps, "
+        f"and an option that moves the ant at less than {IDLE_SPEED} m/s is idle.",
+        "Masters that stand on the same sub-policies are not independent: their seeds are drawn together, as in a "
+        "paired comparison. It concerns claims 9 and 13 and was decided when no penalised master and two seeds of "
+        "claim 9's on AntMaze had been seen; where drawing them apart would decide otherwise, it is said.",
+        "Nothing is corrected for the number of comparisons. With 10 seeds an interval of a difference of means covers "
+        "the truth 92 to 96 times in 100, of a difference of spreads 90 times, with 3 seeds under 80 times (normal "
+        "scores, simulated).",
+    )
+
+
+def _rows_read(results: Results) -> str:
+    return (
+        "Interquartile means over seeds. Control steps: of one run, all its directions counted. Minutes: of training, "
+        f"mean over runs, one core each, without the measuring that follows ({results.study.size.episodes} episodes, "
+        "drawn from the policy and not its mean, or the hand-over matrix and random switching). Way: along the "
+        "straight line. One row with what it stands on: `footwork reproduce --rows ROW`."
+    )
+
+
+def _facts(results: Results) -> dict[str, str]:
+    """What captions say of a study's size."""
+    study = results.study
+    at_k = {k: study.row(f"ablation/maze/k/{k}") for k in (10, 400)}
+    updates = {k: planned_steps(row) // steps_per_iteration(row) for k, row in at_k.items()}
+    own = [planned_steps(row) * row.runs_per_seed for row in map(study.row, ("walker/symmetric", "walker/plain"))]
+    return {
+        "pairs": str(max(1, study.size.ants // 4)),
+        "own_steps": " to ".join(count_in_words(round(steps, -3)) for steps in own),
+        "updates_10": str(updates[10]),
+        "updates_400": str(updates[400]),
+    }
 
 
 def _title(results: Results) -> str:
@@ -154,18 +205,41 @@ def _title(results: Results) -> str:
     return "Footwork: the study" + ("" if size.name == "full" else f" ({size.name})")
 
 
-def _summary(results: Results, judgements: Sequence[Judgement], rows: Sequence[str]) -> str:
-    count = {
-        verdict: sum(j.verdict == verdict for j in judgements) for verdict in ("holds", "does not hold", "undecided")
-    }
-    said = ", ".join(f"{number} {verdict}" for verdict, number in count.items())
-    elsewhere = [j for j in judgements if j.setting.prefix]
-    if elsewhere:
-        ants = ", ".join(dict.fromkeys(j.setting.prefix.strip("/") for j in elsewhere))
-        said += f" ({len(elsewhere)} of the settings are ablations, {ants}, with fewer seeds than a verdict asks for)"
+def _summary(results: Results, judgements: Sequence[Judgement], rows: Sequence[str]) -> list[Block]:
+    """Which claims hold, which do not, and what the others lack."""
+    groups: dict[str, list[str]] = {}
+    for claim in CLAIMS:
+        here = [(j, _standing(j)) for j in judgements if j.claim is claim and not j.setting.prefix]
+        alike = len({standing for _, standing in here}) == 1
+        for j, standing in here[: 1 if alike else None]:
+            name = str(claim.number) if alike else f"{claim.number} ({_SETTINGS[j.setting.schedule]})"
+            groups.setdefault(standing, []).append(name)
+    lines = [f"**{standing}**: {', '.join(groups[standing])}" for standing in _STANDINGS if standing in groups]
     seeds = sum(len(results.samples(row)) for row in rows)
     length = " Runs of any length count." if results.any_length else ""
-    return f"{len(CLAIMS)} claims in {len(judgements)} settings: {said}. {seeds} runs of {len(rows)} rows.{length}"
+    default = find_row("walker/plain")
+    where = f"{default.engine}, {default.task.robot.name} ant"
+    text = (
+        f"{len(CLAIMS)} claims, judged from {seeds} runs of {len(rows)} rows ({where} if not said otherwise).{length}"
+    )
+    elsewhere: dict[str, list[str]] = {}
+    for j in judgements:
+        if j.setting.prefix:
+            elsewhere.setdefault(j.setting.prefix.strip("/"), []).append(f"{j.claim.number} {_standing(j).lower()}")
+    lines += [f"{place}: {', '.join(dict.fromkeys(found))}" for place, found in elsewhere.items()]
+    return [Text(text), Bullets(tuple(lines))]
+
+
+_STANDINGS = ("Holds", "Does not hold", "Undecided with all seeds", "Undecided, too few seeds", "Runs missing")
+_SETTINGS = {"paper": "the paper's setting", "hrl": "our setting"}
+
+
+def _standing(j: Judgement) -> str:
+    """The verdict, or what keeps it from being one."""
+    if j.verdict != "undecided":
+        return j.verdict.capitalize()
+    fewest = min(min(f.seeds) for f in j.findings if f.contrast.decides)
+    return _STANDINGS[4] if fewest == 0 else _STANDINGS[3] if fewest < j.claim.min_seeds else _STANDINGS[2]
 
 
 def all_rows(results: Results) -> list[str]:
@@ -195,7 +269,9 @@ def _brief(judgements: Sequence[Judgement], named: bool = False) -> str:
         deciding = [f for f in j.findings if f.contrast.decides and f.effect is not None]
         place = f"{j.where.removesuffix(f', {SCHEDULES[j.setting.schedule]}')}: " if named else ""
         so_far = "" if j.verdict == j.so_far else f" (so far: {j.so_far})"
-        lines.append(f"{place}{j.verdict}{so_far if deciding else ': no runs yet'}")
+        nothing = not any(any(f.seeds) for f in j.findings)
+        missing = "" if deciding else ": no runs yet" if nothing else ": runs of one side only"
+        lines.append(f"{place}**{j.verdict}**{so_far}{missing}")
         lines += [_said(f) for f in ([f for f in deciding if f.so_far == j.so_far] or deciding)[:1]]
         lines += [f"and {len(deciding) - 1} more"] if len(deciding) > 1 else []
     return "\n".join(lines) or "-"
@@ -206,13 +282,13 @@ def _claims_table(judgements: Sequence[Judgement]) -> TableBlock:
     for j in judgements:
         said = [_said(f) for f in j.findings if f.contrast.decides]
         said += [f"(shown) {_said(f)}" for f in j.findings if not f.contrast.decides and f.effect is not None]
-        rows.append((str(j.claim.number), j.where, j.verdict, "\n".join(said), j.why))
+        rows.append((str(j.claim.number), j.where, f"**{j.verdict}**", "\n".join(said), j.why))
     return TableBlock(("", "where", "verdict", "effect [95 %], P, seeds", "because"), tuple(rows))
 
 
 def _said(finding: Finding) -> str:
     """A comparison in one line."""
-    chance = "" if finding.probability is None else f", P {finding.probability:.2f}"
+    chance = "" if finding.probability is None else f", P {show_chance(finding)}"
     return f"{finding.contrast.words}: {show_effect(finding)}{chance}, {seeds_in_words(_seeds(finding.seeds))}"
 
 
@@ -234,9 +310,9 @@ def _comparisons_table(judgements: Sequence[Judgement]) -> TableBlock:
                 f"{'+' if w > 0 else '−'} {row}" for w, row in zip(f.contrast.weights, f.rows, strict=True)
             ).removeprefix("+ "),
             METRICS[f.contrast.metric].words,
-            f"{f.contrast.rule}, {METRICS[f.contrast.metric].show(f.contrast.bound)}",
+            show_bound(f.contrast),
             show_effect(f),
-            "-" if f.probability is None else f"{f.probability:.2f}",
+            show_chance(f),
             _seeds(f.seeds),
             f.verdict if f.verdict == f.so_far else f"{f.verdict} (so far: {f.so_far})",
         )
@@ -259,13 +335,13 @@ def _rows_table(results: Results, rows: Sequence[str]) -> TableBlock:
     metrics = ("way", "route", "success", "handover", "speed", "return")
     lines = []
     for row in rows:
-        experiment, walker = results.study.row(row), find_row(row).is_walker
-        shown = {"handover", "speed", "return"} if walker else {"way", "route", "success"}
+        shown = {"handover", "speed", "return"} if find_row(row).is_walker else {"way", "route", "success"}
         cells = [_middle(results, row, name) if name in shown else "" for name in metrics]
-        minutes = [curve.seconds[-1] / 60 for _, curve in results.curves(row)]
-        steps = f"{planned_steps(experiment) * experiment.runs_per_seed:,}"
+        minutes = [curve.seconds[-1] / 60 for sample in _one_per_run(results, row) if (curve := results.curve(sample))]
+        steps = sorted({_steps(sample) for sample in results.samples(row)})
+        taken = " to ".join(f"{n:,}" for n in dict.fromkeys((steps[0], steps[-1])))
         wall = f"{np.mean(minutes):.1f}" if minutes else "-"
-        lines.append((row, str(len(results.samples(row))), steps, wall, *cells))
+        lines.append((row, str(len(results.samples(row))), taken, wall, *cells))
     header = (
         "row",
         "seeds",
@@ -281,13 +357,24 @@ def _rows_table(results: Results, rows: Sequence[str]) -> TableBlock:
     return TableBlock(header, tuple(lines))
 
 
+def _one_per_run(results: Results, row: str) -> list[Sample]:
+    """A seed of each run: several may have been trained in one batch."""
+    return list({sample.run.path: sample for sample in results.samples(row)}.values())
+
+
+def _steps(sample: Sample) -> int:
+    """Control steps that a seed took, all its directions counted."""
+    return int(sample.run.summary()["steps"]) * sample.experiment.runs_per_seed
+
+
 def _middle(results: Results, row: str, metric: str) -> str:
     scores = results.scores(row, metric)
-    return METRICS[metric].show(float(iqm(scores))) if len(scores) else "-"
+    unit = " %" if METRICS[metric].is_share else ""
+    return METRICS[metric].number(float(iqm(scores))) + unit if len(scores) else "-"
 
 
-def _choices_table() -> TableBlock:
-    return TableBlock(("what", "here"), tuple((choice.what, choice.here) for choice in CHOICES))
+def _choices_table(results: Results) -> TableBlock:
+    return TableBlock(("what", "here"), tuple((choice.what, choice.here) for choice in choices(results.study)))
 
 
 def _left_out(results: Results, drawn: Sequence[Drawn]) -> list[Block]:
@@ -300,9 +387,12 @@ def _left_out(results: Results, drawn: Sequence[Drawn]) -> list[Block]:
     few = {row: len(results.samples(row)) for row in planned if 0 < len(results.samples(row)) < planned[row]}
     blocks: list[Block] = []
     if missing:
-        blocks.append(Text(f"Rows of the study that have no finished run: {', '.join(dict.fromkeys(missing))}."))
+        blocks.append(Text(f"Rows of the study that have no finished run: {in_braces(dict.fromkeys(missing))}."))
     if few:
-        said = ", ".join(f"{row} {have} of {planned[row]}" for row, have in few.items())
+        by_count: dict[str, list[str]] = {}
+        for row, have in few.items():
+            by_count.setdefault(f"{have} of {planned[row]}", []).append(row)
+        said = "; ".join(f"{count}: {in_braces(group)}" for count, group in by_count.items())
         blocks.append(Text(f"Rows with fewer seeds than the study plans: {said}."))
     if results.problems:
         here = f"{results.study.runs}{os.sep}"
@@ -313,40 +403,67 @@ def _left_out(results: Results, drawn: Sequence[Drawn]) -> list[Block]:
 
 def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     found: dict[tuple[str, str], int] = {}
+    by_count: dict[int, list[str]] = {}
+    steps, seconds = 0, 0.0
     for row in rows:
-        for sample in results.samples(row):
+        samples = results.samples(row)
+        by_count.setdefault(len(samples), []).append(row)
+        for sample in samples:
+            steps += _steps(sample)
             for name, version in sample.run.versions().items():
                 found[name, str(version)] = found.get((name, str(version)), 0) + 1
+        seconds += sum(curve.seconds[-1] for sample in _one_per_run(results, row) if (curve := results.curve(sample)))
     versions = tuple((name, version, str(count)) for (name, version), count in sorted(found.items()))
-    machine = read_machine(results.study.runs) or "not recorded"
-    steps = sum(
-        planned_steps(results.study.row(row)) * results.study.row(row).runs_per_seed * len(results.samples(row))
-        for row in rows
-    )
-    hours = sum(curve.seconds[-1] for row in rows for _, curve in results.curves(row)) / 3600
-    spent = f"{steps / 1e6:,.1f} M control steps and {hours:.1f} hours of one core in training alone"
+    begun = read_origin(results.study.runs)
+    commit = f" at commit {begun.commit}" if begun.commit else ""
+    spent = f"{steps / 1e6:,.1f} M control steps and {seconds / 3600:.1f} hours of one core in training alone"
     here = f"footwork {footwork.__version__}, Python {platform.python_version()}"
+    quick = "" if results.study.size.short is None else " --quick"
+    made = [f"footwork reproduce{quick} --rows {in_braces(group)} --seeds {n}" for n, group in sorted(by_count.items())]
     again = "footwork report --runs results --to .  # in this folder: the same report from the files beside it"
     return [
+        Text(f"The runs that are in it, begun{commit} (seeds 0, 1, ... of each row):"),
+        Code("\n".join(reversed(made))),
+        Text("The report:"),
         Code(f"{command}\n{again}"),
-        Text(f"Machine of the runs: {machine}; {spent}. Report written by {here}, source {source_digest()}."),
+        Text(
+            f"Machine on which the study was begun: {begun.machine or 'not recorded'}; {spent}. Report written by "
+            f"{here}, source {source_digest()}. Where something has two versions here, not all runs are of one make."
+        ),
         TableBlock(("version of", "is", "runs"), versions),
     ]
 
 
 def check_place(runs: Path, to: Path) -> None:
-    """Refuse a folder for the report in which writing it would cost something that is not an older report's.
+    """Refuse a folder for the report in which writing it would cost something that ``runs`` does not hold.
+
+    What a report that was killed in the middle had put aside is brought back first.
 
     Raises:
-        RunError: ``to``/results holds the runs, or something that no report wrote.
+        RunError: ``to``/results holds the runs, or something that no report wrote, or runs that ``runs`` lacks.
     """
     place = to / RESULTS
+    aside = _beside(place)[1]
+    if aside.exists() and not place.exists():
+        aside.rename(place)
     if runs.resolve() == place.resolve():  # a report made again from its own files leaves them as they are
         return
     if runs.resolve().is_relative_to(place.resolve()):
         raise RunError(f"{place} would be replaced, and the runs in {runs} are in it: choose another --to")
     if place.exists() and not (place / WRITTEN).is_file() and (not place.is_dir() or any(place.iterdir())):
         raise RunError(f"{place} holds something that no report wrote (it has no {WRITTEN}): choose another --to")
+    there = sorted(path.parent.relative_to(place) for path in place.rglob("DONE"))
+    lost = [path for path in there if not (runs / path / "DONE").is_file()]
+    if lost:
+        raise RunError(
+            f"{place} would be replaced, and it holds {len(lost)} finished runs that {runs} lacks, {lost[0]} among "
+            f"them: copy them there to go on with that study (all: cp -r {place} {runs}), or choose another --to"
+        )
+
+
+def _beside(place: Path) -> tuple[Path, Path]:
+    """Where results are built, and where the ones before are put while they change places."""
+    return place.with_name(f".{place.name}.new"), place.with_name(f".{place.name}.old")
 
 
 def export(results: Results, to: Path) -> None:
@@ -366,7 +483,7 @@ def export(results: Results, to: Path) -> None:
     check_place(results.study.runs, to.parent)
     if to.resolve() == results.study.runs.resolve():
         return
-    new, old = to.with_name(f".{to.name}.new"), to.with_name(f".{to.name}.old")
+    new, old = _beside(to)
     for left in (new, old):
         shutil.rmtree(left, ignore_errors=True)
     new.mkdir(parents=True)
@@ -391,8 +508,8 @@ def _copy_run(results: Results, sample: Sample, place: Path, row: str, first: bo
     curve = results.whole_curve(sample)
     if curve is not None:
         copy_curve(curve, run, sample.experiment, place / CURVE)
-    stood_on = row in {experiment.needs for experiment in EXPERIMENTS.values()}
-    if (first or stood_on) and run.policy_path.is_file():
+    stood_on = {results.study.row(other).needs for other in all_rows(results)}
+    if (first or row in stood_on) and run.policy_path.is_file():
         try:
             actors, meta = read_actors(run.policy_path)
         except CheckpointError as error:
@@ -414,14 +531,16 @@ def _as_markdown(block: Block, to: Path) -> str:
             return f"{'#' * level} {text}"
         case Text(text):
             return text
+        case Bullets(lines):
+            return "\n".join(f"* {line}" for line in lines)
         case Code(text):
             return f"```\n{text}\n```"
         case TableBlock(header, rows):
-            lines = [header, ("---",) * len(header), *rows]
-            return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
-        case Picture(drawn):
+            every = [header, ("---",) * len(header), *rows]
+            return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in every)
+        case Picture(drawn, facts):
             png, svg = (os.path.relpath(path, to) for path in drawn.files)
-            return f"### {_heading(drawn)}\n\n![{drawn.figure.title}]({png})\n\n{_caption(drawn)} [SVG]({svg})"
+            return f"### {_heading(drawn)}\n\n![{drawn.figure.title}]({png})\n\n{_caption(drawn, facts)} [SVG]({svg})"
 
 
 def _cell(text: str) -> str:
@@ -436,10 +555,10 @@ def _heading(drawn: Drawn) -> str:
     return f"{number}. {figure.title}{where}{paper}"
 
 
-def _caption(drawn: Drawn) -> str:
-    without = f" Without finished runs: {', '.join(drawn.without)}." if drawn.without else ""
+def _caption(drawn: Drawn, facts: Mapping[str, str]) -> str:
+    without = f" Without finished runs: {in_braces(drawn.without)}." if drawn.without else ""
     under = f" --under {drawn.prefix.strip('/')}" if drawn.prefix else ""
-    return f"{drawn.figure.caption}{without} Drawn by `footwork figures {drawn.figure.name}{under}`."
+    return f"{drawn.figure.caption.format(**facts)}{without} Drawn by `footwork figures {drawn.figure.name}{under}`."
 
 
 _STYLE = """
@@ -471,23 +590,19 @@ def _as_html(block: Block) -> str:
             return f"<h{level}>{html.escape(text)}</h{level}>"
         case Text(text):
             return f"<p>{_inline(text)}</p>"
+        case Bullets(lines):
+            return "<ul>" + "\n".join(f"<li>{_inline(line)}</li>" for line in lines) + "</ul>"
         case Code(text):
             return f"<pre>{html.escape(text)}</pre>"
         case TableBlock(header, rows):
-            lines = ["".join(f"<th>{html.escape(cell)}</th>" for cell in header)]
-            lines += ["".join(_table_cell(cell) for cell in row) for row in rows]
-            return "<table>" + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
-        case Picture(drawn):
+            every = ["".join(f"<th>{html.escape(cell)}</th>" for cell in header)]
+            every += ["".join(f"<td>{_inline(cell)}</td>" for cell in row) for row in rows]
+            return "<table>" + "\n".join(f"<tr>{line}</tr>" for line in every) + "</table>"
+        case Picture(drawn, facts):
             data = base64.b64encode(drawn.files[0].read_bytes()).decode()
             image = f'<img src="data:image/png;base64,{data}" alt="{html.escape(drawn.figure.title)}">'
-            caption = f"<figcaption>{_inline(_caption(drawn))}</figcaption>"
+            caption = f"<figcaption>{_inline(_caption(drawn, facts))}</figcaption>"
             return f"<figure><h3>{html.escape(_heading(drawn))}</h3>{image}{caption}</figure>"
-
-
-def _table_cell(text: str) -> str:
-    verdict = text if text in ("holds", "does not hold", "undecided") else ""
-    mark = f' class="{verdict.replace(" ", "-")}"' if verdict else ""
-    return f"<td{mark}>{html.escape(text)}</td>"
 
 
 def _inline(text: str) -> str:
@@ -496,9 +611,16 @@ def _inline(text: str) -> str:
     for number, part in enumerate(html.escape(text).split("`")):
         bold = part.split("**")
         parts.append(
-            f"<code>{part}</code>" if number % 2 else "".join(f"<b>{p}</b>" if i % 2 else p for i, p in enumerate(bold))
+            f"<code>{part}</code>" if number % 2 else "".join(_bold(p) if i % 2 else p for i, p in enumerate(bold))
         )
     return "".join(parts)
+
+
+def _bold(text: str) -> str:
+    """Bold; verdicts in their colours."""
+    verdict = text.lower()
+    mark = f' class="{verdict.replace(" ", "-")}"' if verdict in ("holds", "does not hold", "undecided") else ""
+    return f"<b{mark}>{text}</b>"
 
 
 __all__ = ["all_rows", "check_place", "export", "report_blocks", "write_report"]

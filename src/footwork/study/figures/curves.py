@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,24 @@ from footwork.arena import DIRECTIONS, shortest_path
 from footwork.palette import DIRECTION_COLOURS
 from footwork.statistics import DRAWS, Floats, curve_band, generator_for
 from footwork.study.experiments import SCHEDULES, find_row
-from footwork.study.figures.style import count_in_words, empty, labels_of, legend_below, log_axis, look_of, panels
-from footwork.study.results import Curve, Results, Sample, seeds_in_words
+from footwork.study.figures.style import (
+    count_in_words,
+    empty,
+    label_of,
+    legend_below,
+    log_axis,
+    look_of,
+    panels,
+    seeds_of,
+)
+from footwork.study.results import Results, Sample, seeds_in_words
+from footwork.study.training_curves import Curve
 from footwork.train import Experiment
 
 _POINTS = 100
 _SMOOTH = 20  # curves of tasks are averaged over the last twentieth of the training each time
-_FIRST = 20_000  # control steps, where logarithmic axes begin
-_STEPS = (3e4, 1e5, 3e5, 1e6, 3e6, 1e7)
-_MINUTES = (0.03, 0.1, 0.3, 1, 3, 10)
+_DECADES = 2.7  # of a logarithmic axis, at most
+_MARKED = 14  # points of a curve from one mark to the next
 Value = Callable[[Sample, Curve], Floats]  # of a seed's curve, [X]
 
 
@@ -66,7 +76,15 @@ def on_common_grid(xs: list[Floats], ys: list[Floats], log: bool = False) -> tup
 
 
 def draw_curve(
-    ax: Any, xs: list[Floats], ys: list[Floats], name: str, colour: str, line: Any, label: str, log: bool = False
+    ax: Any,
+    xs: list[Floats],
+    ys: list[Floats],
+    name: str,
+    colour: str,
+    label: str,
+    line: Any = "-",
+    mark: str = "",
+    log: bool = False,
 ) -> bool:
     """IQM over seeds with its pointwise 95 % band; whether there was anything to draw."""
     found = on_common_grid(xs, ys, log)
@@ -74,14 +92,16 @@ def draw_curve(
         return False
     x, y = found
     middle, (low, high) = curve_band(y, generator_for(f"curve {name}"), DRAWS)
-    ax.plot(x, middle, color=colour, ls=line, lw=1.5, label=label)
+    first = zlib.crc32(label.encode()) % _MARKED  # not every row's marks at the same places
+    style = {"marker": mark, "ms": 4.0, "markevery": (first, _MARKED)} if mark else {}
+    ax.plot(x, middle, color=colour, ls=line, lw=1.4, label=label, **style)
     if len(y) > 1:
         ax.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
     return True
 
 
 def draw_row(
-    ax: Any, results: Results, row: str, value: Value, label: str, x: str = "step", log: bool = False, line: Any = None
+    ax: Any, results: Results, row: str, value: Value, label: str, x: str = "step", log: bool = False, line: Any = "-"
 ) -> bool:
     """A row's curve against control steps or minutes."""
     curves = results.curves(row)
@@ -91,7 +111,7 @@ def draw_row(
     xs = [curve.step if x == "step" else curve.seconds / 60 for _, curve in curves]
     ys = [value(sample, curve) for sample, curve in curves]
     name = f"{row} {x} {value.__name__}"
-    return draw_curve(ax, xs, ys, name, look.colour, look.line if line is None else line, label, log)
+    return draw_curve(ax, xs, ys, name, look.colour, label, line, look.mark, log)
 
 
 def task_curves(results: Results, rows: tuple[str, ...]) -> Any:
@@ -99,24 +119,22 @@ def task_curves(results: Results, rows: tuple[str, ...]) -> Any:
     kinds = {"paper": [r for r in rows if not _guided(r)], "hrl": [r for r in rows if _guided(r)]}
     log = any(find_row(row).total_steps > 4 * find_row(rows[0]).total_steps for row in rows)
     figure, axes = panels(1, 2, 3.6, share_y=True)
-    labels = labels_of(results, rows)
     for ax, (schedule, mine) in zip(axes[0], kinds.items(), strict=True):
-        drawn = [draw_row(ax, results, row, share_of_way, labels.get(row, ""), log=log) for row in mine]
-        straight = all(find_row(row).task.potential == "straight" for row in mine)
-        ax.set_title(
-            f"{SCHEDULES[schedule]};\nprogress {'along the straight line' if straight else 'around the walls'}"
-        )
+        drawn = [draw_row(ax, results, row, share_of_way, label_of(row), log=log) for row in mine]
+        ax.set_title(f"{SCHEDULES[schedule]};\n{_progress(mine)}")
+        _steps(ax, log, seeds_of(results, mine))
         ax.axhline(1.0, color="#999999", lw=0.8, ls=":")
-        ax.set_xlabel("control steps" + (" (logarithmic)" if log else ""))
-        if log:
-            log_axis(ax, _STEPS, count_in_words, _FIRST, max(_STEPS))
-        else:
-            _plain_steps(ax)
         if not any(drawn):
             empty(ax, "no finished runs yet" if mine else "no such rows")
     axes[0, 0].set_ylabel("distance part of the reward\n(share of the whole way; 1: at the goal)")
     legend_below(figure, axes[0])
     return figure
+
+
+def _progress(rows: Sequence[str]) -> str:
+    """What the distance part of some rows' reward measures."""
+    straight = all(find_row(row).task.potential == "straight" for row in rows)
+    return f"progress {'along the straight line' if straight else 'around the walls'}"
 
 
 def _guided(row: str) -> bool:
@@ -127,20 +145,18 @@ def _guided(row: str) -> bool:
 def penalty_curves(results: Results, rows: tuple[str, ...]) -> Any:
     """Masters with and without stability penalties in their reward, on both tasks."""
     figure, axes = panels(2, 2, 2.8, share_y=True)
-    labels = labels_of(results, rows, _with_or_without)
     for line, place in zip(axes, ("bandit", "maze"), strict=True):
         for ax, schedule in zip(line, SCHEDULES, strict=True):
-            drawn = []
-            for row in rows:
-                if row.startswith((f"{place}/{schedule}/", f"{place}/{schedule}-penalised/")):
-                    dashes = (0, (1, 1.5)) if _penalised(row) else "-"
-                    drawn.append(draw_row(ax, results, row, share_of_way, labels.get(row, ""), line=dashes))
-            ax.set_title(f"Ant{place.capitalize()}: {SCHEDULES[schedule]}")
-            ax.set_xlabel("control steps")
-            _plain_steps(ax)
+            mine = [row for row in rows if row.startswith((f"{place}/{schedule}/", f"{place}/{schedule}-penalised/"))]
+            drawn = [
+                draw_row(ax, results, row, share_of_way, _with_or_without(row), line=":" if _penalised(row) else "-")
+                for row in mine
+            ]
+            ax.set_title(f"Ant{place.capitalize()}: {SCHEDULES[schedule]};\n{_progress(mine)}")
+            _steps(ax, False, seeds_of(results, mine))
             if not any(drawn):
                 empty(ax, "no finished runs yet")
-        line[0].set_ylabel("distance part of the reward")
+        line[0].set_ylabel("distance part of the reward\n(share of the whole way)")
     legend_below(figure, list(axes.flat), columns=2)
     return figure
 
@@ -156,10 +172,10 @@ def direction_curves(results: Results, rows: tuple[str, ...]) -> Any:
                 xs = [curve.step for _, curve in curves]
                 ys = [curve.values["return"][:, i] for _, curve in curves]
                 line = ("-", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1)))[i]
-                draw_curve(ax, xs, ys, f"{row} {direction}", DIRECTION_COLOURS[i], line, direction)
+                draw_curve(ax, xs, ys, f"{row} {direction}", DIRECTION_COLOURS[i], direction, line)
         ax.set_title(f"{row}\n({seeds_in_words(len(curves))})")
+        _steps(ax, False)
         ax.set_xlabel("control steps per direction")
-        _plain_steps(ax)
         if not curves:
             empty(ax, "no finished runs yet")
     for ax in axes[:, 0]:
@@ -179,17 +195,15 @@ def _with_or_without(row: str) -> str:
 def success_curves(results: Results, rows: tuple[str, ...]) -> Any:
     """Share of training episodes that end in the goal, against control steps and against wall time."""
     figure, axes = panels(2, 2, 2.7, share_y=True)
-    labels = labels_of(results, rows)
     for line, place in zip(axes, ("bandit", "maze"), strict=True):
         for ax, x in zip(line, ("step", "minutes"), strict=True):
             mine = [row for row in rows if f"/{place}/" in f"/{row}"]
-            drawn = [draw_row(ax, results, row, success, labels.get(row, ""), x, log=True) for row in mine]
-            if x == "step":
-                log_axis(ax, _STEPS, count_in_words, _FIRST, max(_STEPS))
-            else:
-                log_axis(ax, _MINUTES, lambda minutes: f"{minutes:g}", min(_MINUTES), max(_MINUTES))
+            drawn = [draw_row(ax, results, row, success, label_of(row), x, log=True) for row in mine]
             ax.set_title(f"Ant{place.capitalize()}")
-            ax.set_xlabel("control steps (logarithmic)" if x == "step" else "minutes of training (logarithmic)")
+            _steps(ax, True, seeds_of(results, mine))
+            if x == "minutes":
+                log_axis(ax, lambda minutes: f"{minutes:g}", _DECADES)
+                ax.set_xlabel("minutes of training (logarithmic)")
             ax.set_ylim(-0.03, 1.03)
             if not any(drawn):
                 empty(ax, "no finished runs yet")
@@ -198,7 +212,12 @@ def success_curves(results: Results, rows: tuple[str, ...]) -> Any:
     return figure
 
 
-def _plain_steps(ax: Any) -> None:
+def _steps(ax: Any, log: bool, seeds: str = "") -> None:
+    """The x axis of control steps, with how many seeds are drawn."""
+    ax.set_xlabel("control steps" + (" (logarithmic)" if log else "") + (f"; {seeds}" if seeds else ""))
+    if log:
+        log_axis(ax, count_in_words, _DECADES)
+        return
     ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.xaxis.set_major_formatter(lambda x, _: count_in_words(x) if x else "0")
     ax.set_xlim(left=0)

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from footwork.arena import DIRECTIONS
-from footwork.statistics import Effect, contrast, generator_for, performance_profile
+from footwork.statistics import Effect, Floats, contrast, generator_for, iqm, profile_band
 from footwork.study.experiments import ANNEALED, GRIDS, Grid
-from footwork.study.figures.style import Look, empty, interval_marks, labels_of, legend_below, look_of, panels
+from footwork.study.figures.style import Look, empty, interval_marks, label_of, legend_below, look_of, panels, seeds_of
 from footwork.study.measure import TRANSITIONS
-from footwork.study.results import METRICS, Results, seeds_in_words
+from footwork.study.metrics import METRICS
+from footwork.study.results import Results, seeds_in_words
 
 _ARROWS = dict(zip(DIRECTIONS, ("→", "↑", "←", "↓"), strict=True))
 
@@ -20,20 +21,21 @@ def handover_maps(results: Results, rows: tuple[str, ...]) -> Any:
     """Share of hand-overs that succeed, from each direction to each, and the mean speed after."""
     figure, axes = panels(-(-len(rows) // 4), 4, 2.2, layout="compressed")
     image = None
-    for ax, row in zip(axes.flat, rows, strict=False):
-        entries = results.measurements(row, TRANSITIONS)
+    measured = {row: results.measurements(row, TRANSITIONS) for row in rows}
+    least = min((_cells(entries, "success").min() for entries in measured.values() if entries), default=0.0)
+    lowest = min(np.floor(10 * least) / 10, 0.9)
+    for ax, (row, entries) in zip(axes.flat, measured.items(), strict=False):
         ax.grid(False)
         ax.set_title(f"{row.removeprefix('walker/')}\n{seeds_in_words(len(entries))}", fontsize=8)
         if not entries:
             ax.axis("off")
             empty(ax, "no finished runs yet")
             continue
-        success = np.mean([[[c["success"] for c in line] for line in e["handover"]] for e in entries], axis=0)
-        speed = np.mean([[[c["speed_mps"] for c in line] for line in e["handover"]] for e in entries], axis=0)
-        image = ax.imshow(success, vmin=0, vmax=1, cmap="cividis")
+        success, speed = _cells(entries, "success"), _cells(entries, "speed_mps")
+        image = ax.imshow(success, vmin=lowest, vmax=1, cmap="cividis")
         for i in range(4):
             for j in range(4):
-                colour = "white" if success[i, j] < 0.55 else "black"
+                colour = "white" if success[i, j] < (lowest + 1) / 2 else "black"
                 text = f"{100 * success[i, j]:.0f}\n{speed[i, j]:.1f}"
                 ax.text(j, i, text, ha="center", va="center", color=colour, fontsize=7, linespacing=1.0)
         ax.set_xticks(range(4), list(_ARROWS.values()))
@@ -47,6 +49,11 @@ def handover_maps(results: Results, rows: tuple[str, ...]) -> Any:
     return figure
 
 
+def _cells(entries: list[dict[str, Any]], name: str) -> Floats:
+    """A number of the hand-over matrix [4, 4], interquartile mean over seeds."""
+    return iqm([[[cell[name] for cell in line] for line in entry["handover"]] for entry in entries], axis=0)
+
+
 def switching(results: Results, rows: tuple[str, ...]) -> Any:
     """Speed per option and share of idle options and of ants on their backs, against the time between switches."""
     names = {
@@ -55,19 +62,16 @@ def switching(results: Results, rows: tuple[str, ...]) -> Any:
         "upside_down": "share upside down at the end",
     }
     figure, axes = panels(1, 3, 3.2)
-    labels = labels_of(results, rows)
-    apart = np.geomspace(0.9, 1.1, len(rows))  # bars of rows beside each other, not over each other
+    there = {row: entries for row in rows if (entries := results.measurements(row, TRANSITIONS))}
+    apart = np.geomspace(0.9, 1.1, len(there)) if len(there) > 1 else [1.0]  # bars beside each other
     for ax, (name, words) in zip(axes[0], names.items(), strict=True):
-        for row, shift in zip(rows, apart, strict=True):
-            entries = results.measurements(row, TRANSITIONS)
-            if not entries:
-                continue
+        for (row, entries), shift in zip(there.items(), apart, strict=False):
             periods = sorted({int(k) for entry in entries for k in entry["switching"]})
             values = [[e["switching"][str(k)][name] for e in entries if str(k) in e["switching"]] for k in periods]
             effects = [_effect(v, f"switching {row} {name} {k}") for k, v in zip(periods, values, strict=True)]
-            interval_marks(ax, np.multiply(periods, shift), effects, look_of(row), labels[row])
+            interval_marks(ax, np.multiply(periods, shift), effects, look_of(row), label_of(row))
         ax.set_title(words)
-        ax.set_xlabel("control steps between switches")
+        ax.set_xlabel(f"control steps between switches\n{seeds_of(results, there)}")
         ax.set_xscale("log")
         ax.set_xticks([25, 50, 100, 200], ["25", "50", "100", "200"])
         ax.minorticks_off()
@@ -98,7 +102,7 @@ def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, .
             values, effects = _points(results, grid, metric)
             x = values if all(isinstance(v, int | float) for v in values) else list(range(len(values)))
             if values:
-                interval_marks(ax, x, effects, Look("#0072B2", "-", "o"), grid.name)
+                interval_marks(ax, x, effects, Look("#0072B2", "o"), grid.name)
             if x is values and values:
                 ax.set_xscale("log")
             counts = [len(results.samples(grid.points()[value])) for value in values]
@@ -106,7 +110,7 @@ def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, .
             ax.minorticks_off()
             if not values:
                 empty(ax, "no finished\nruns yet")
-            ax.set_ylim((-0.05, 1.05) if METRICS[metric].percent else (0.0, 1.1 * highest))
+            ax.set_ylim((-0.05, 1.05) if METRICS[metric].is_share else (0.0, 1.1 * highest))
             ax.set_title(grid.name.removeprefix("ablation/"))
             ax.set_xlabel(f"{grid.words};\nbelow: seeds")
         line[0].set_ylabel(_wrapped(METRICS[metric].words))
@@ -140,18 +144,25 @@ def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
-    """B as a number or as a size, the potential, the heavy and the light ant: rows side by side."""
-    figure, axes = panels(3, 1, 2.0)
-    axes[0, 0].get_gridspec().set_height_ratios((7, 12, 4))
+    """B as a number or as a size, the potential, the heavy and the light ant: rows side by side, in three metrics."""
     fields = [g for g in GRIDS if g.field in ("ppo.minibatch_size", "task.potential") and "walker" not in g.base]
     masters = [row for grid in fields for row in grid.points().values()]
     walkers = [row for grid in GRIDS if grid.base == "walker/plain" for row in grid.points().values()]
-    _dots(axes[0, 0], results, "way", masters)
-    _dots(axes[1, 0], results, "handover", [*walkers, *_ANNEALED, *(row for row in _OF_ANTS if "walker/" in row)])
-    _dots(axes[2, 0], results, "way", [row for row in _OF_ANTS if "walker/" not in row])
-    titles = ("B and the potential: masters", "B, annealing and the ant: hand-overs", "the ant: masters")
-    for ax, title in zip(axes[:, 0], titles, strict=True):
-        ax.set_title(title)
+    lines = (
+        ("B and the potential: masters", masters, ("way", "route", "success")),
+        (
+            "B, annealing and the ant: sub-policies",
+            [*walkers, *_ANNEALED, *(row for row in _OF_ANTS if "walker/" in row)],
+            ("handover", "moving", "speed"),
+        ),
+        ("the ant: masters", [row for row in _OF_ANTS if "walker/" not in row], ("way", "route", "success")),
+    )
+    figure, axes = panels(3, 3, 2.2)
+    axes[0, 0].get_gridspec().set_height_ratios([len(set(names)) + 2 for _, names, _ in lines])
+    for line, (title, names, metrics) in zip(axes, lines, strict=True):
+        for ax, metric in zip(line, metrics, strict=True):
+            _dots(ax, results, metric, list(dict.fromkeys(names)), named=ax is line[0])
+        line[0].set_title(title, loc="left")
     return figure
 
 
@@ -178,39 +189,46 @@ COMPARED: tuple[str, ...] = tuple(
 )
 
 
-def _dots(ax: Any, results: Results, metric: str, rows: list[str]) -> None:
-    """A metric of several rows, one line each."""
-    names = list(dict.fromkeys(rows))
-    for y, row in enumerate(names):
+def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) -> None:
+    """A metric of several rows, one line each; names, and numbers of seeds, stand left of the first panel."""
+    names = []
+    for y, row in enumerate(rows):
         scores = results.scores(row, metric)
+        names.append(f"{row.removeprefix('ablation/')} ({len(scores)})")
         if len(scores):
-            ax.text(1.06, y, f"n = {len(scores)}", va="center", fontsize=6.5, color="#555555")
             e = _effect(scores, f"dots {row} {metric}")
             ax.plot([e.low, e.high], [y, y], color="#0072B2", lw=2, solid_capstyle="butt")
-            ax.plot(e.estimate, y, "o", color="#0072B2", ms=5)
-        else:
-            ax.text(0.02, y, "no runs yet", va="center", fontsize=7, color="#888888")
-    ax.set_yticks(range(len(names)), [name.removeprefix("ablation/") for name in names], fontsize=7)
-    ax.set_ylim(len(names) - 0.5, -0.5)
-    ax.set_xlim(-0.05, 1.05)
-    ax.set_xlabel(_wrapped(METRICS[metric].words, 30))
+            ax.plot(e.estimate, y, "o", color="#0072B2", ms=4)
+        elif metric != "route" or "bandit/" not in row:  # a way around walls needs walls
+            ax.text(
+                0.03, y, "no runs yet", va="center", fontsize=6, color="#888888", transform=ax.get_yaxis_transform()
+            )
+    ax.set_yticks(range(len(rows)), names if named else [""] * len(rows), fontsize=6.5)
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    if METRICS[metric].is_share:
+        ax.set_xlim(right=1.03)
+    ax.set_xlabel(_wrapped(METRICS[metric].words, 30), fontsize=7)
 
 
 def profiles(results: Results, rows: tuple[str, ...]) -> Any:
     """Share of runs (seeds) that get farther than each share of the way."""
     figure, axes = panels(1, 2, 3.3, share_y=True)
-    labels = labels_of(results, rows)
     thresholds = np.linspace(0.0, 1.0, 201)
     for ax, place in zip(axes[0], ("bandit", "maze"), strict=True):
-        for row in rows:
-            if f"/{place}/" in f"/{row}" and len(scores := results.scores(row, "way")):
-                look = look_of(row)
-                profile = performance_profile(scores, thresholds)
-                ax.step(thresholds, profile, color=look.colour, ls=look.line, lw=1.5, label=labels[row], where="post")
+        mine = [row for row in rows if f"/{place}/" in f"/{row}"]
+        for number, row in enumerate(mine):
+            scores = results.scores(row, "way")
+            if not len(scores):
+                continue
+            look = look_of(row)
+            middle, (low, high) = profile_band(scores, thresholds, generator_for(f"profile {row}"))
+            style = {"color": look.colour, "marker": look.mark, "ms": 4.0, "markevery": (3 * number, 25)}
+            ax.step(thresholds, middle, lw=1.4, label=label_of(row), where="post", **style)
+            ax.fill_between(thresholds, low, high, step="post", color=look.colour, alpha=0.10, lw=0)
         if not ax.get_legend_handles_labels()[0]:
             empty(ax, "no finished runs yet")
         ax.set_title(f"Ant{place.capitalize()}")
-        ax.set_xlabel("share of the way, τ")
+        ax.set_xlabel(f"share of the way, τ; {seeds_of(results, mine)}")
         ax.set_ylim(-0.02, 1.02)
     axes[0, 0].set_ylabel("share of runs with way > τ")
     legend_below(figure, list(axes[0]))

@@ -49,17 +49,33 @@ def _crop(axes: Any, arena: Arena, margin: float = 0.5) -> None:
     axes.tick_params(labelsize=7)
 
 
+def _draw_path(axes: Any, points: Any, choices: Any) -> None:
+    """A master's path [N, 2], its pieces coloured by the sub-policy in use [N - 1]; without, grey."""
+    if not len(choices):
+        axes.plot(points[:, 0], points[:, 1], color=FLAT_COLOUR, lw=0.8, alpha=0.7)
+        return
+    segments = np.stack([points[:-1], points[1:]], axis=1)
+    colours = [DIRECTION_COLOURS[choice] for choice in choices]
+    axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=1.1, alpha=0.75))
+
+
 def draw_paths(axes: Any, arena: Arena, episodes: Episodes, goal_radius: float | None, most: int = 40) -> None:
     """Paths seen from above; a master's are coloured by the sub-policy in use."""
     for row in range(min(most, episodes.paths.shape[1])):
-        points = episodes.paths[:, row]
-        if not episodes.choices.size:
-            axes.plot(points[:, 0], points[:, 1], color=FLAT_COLOUR, lw=0.8, alpha=0.6)
-            continue
-        segments = np.stack([points[:-1], points[1:]], axis=1)
-        colours = [DIRECTION_COLOURS[choice] for choice in episodes.choices[:, row]]
-        axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=1.1, alpha=0.75))
+        _draw_path(axes, episodes.paths[:, row], episodes.choices[:, row] if episodes.choices.size else ())
     _draw_arena(axes, arena, goal_radius)
+
+
+def _directions() -> list[Line2D]:
+    """Of the legend: the sub-policy in use."""
+    named = zip(DIRECTIONS, DIRECTION_COLOURS, strict=True)
+    return [Line2D([], [], color=colour, lw=2, label=f"sub-policy {name}") for name, colour in named]
+
+
+def _places() -> list[Line2D]:
+    """Of the legend: start and goal."""
+    start = Line2D([], [], marker="o", ls="", mfc="white", mec="black", label="start")
+    return [start, Line2D([], [], marker="o", ls="", mfc=GOAL_COLOUR, mec="black", ms=9, label="goal")]
 
 
 def paths_figure(
@@ -70,14 +86,7 @@ def paths_figure(
     for ax, (title, episodes) in zip(axes[0], panels.items(), strict=True):
         draw_paths(ax, arena, episodes, goal_radius)
         ax.set_title(title, fontsize=11)
-    handles = [
-        Line2D([], [], color=c, lw=2, label=f"sub-policy {d}")
-        for d, c in zip(DIRECTIONS, DIRECTION_COLOURS, strict=True)
-    ]
-    handles += [
-        Line2D([], [], marker="o", ls="", mfc="white", mec="black", label="start"),
-        Line2D([], [], marker="o", ls="", mfc=GOAL_COLOUR, mec="black", ms=9, label="goal"),
-    ]
+    handles = [*_directions(), *_places()]
     figure.legend(handles=handles, loc="lower center", ncols=6, frameon=False, fontsize=9)
     if note:
         figure.suptitle(note, fontsize=11)
@@ -128,12 +137,7 @@ def maze_paths(results: Results, rows: tuple[str, ...]) -> Any:
             ax.set_xticks([])
         for path in [] if entry is None else entry["paths"]:
             points = np.array(path["xy"])
-            if not path["choices"]:
-                ax.plot(points[:, 0], points[:, 1], color=FLAT_COLOUR, lw=0.9, alpha=0.75)
-                continue
-            segments = np.stack([points[:-1], points[1:]], axis=1)
-            colours = [DIRECTION_COLOURS[choice] for choice in path["choices"][: len(segments)]]
-            ax.add_collection(LineCollection(list(segments), colors=colours, linewidths=1.1, alpha=0.8))
+            _draw_path(ax, points, path["choices"][: len(points) - 1])
         _draw_arena(ax, find_row(row).task.arena, None)
         _crop(ax, find_row(row).task.arena)
         words = (
@@ -144,11 +148,7 @@ def maze_paths(results: Results, rows: tuple[str, ...]) -> Any:
         ax.set_title(f"{row}\n{words}", fontsize=8)
     for ax in axes.flat[len(rows) :]:
         ax.axis("off")
-    handles = [
-        Line2D([], [], color=colour, lw=2, label=f"sub-policy {direction}")
-        for direction, colour in zip(DIRECTIONS, DIRECTION_COLOURS, strict=True)
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    figure.legend(handles=[*_directions(), *_places()], loc="outside lower center", ncols=3)
     return figure
 
 
@@ -168,4 +168,6 @@ def flat_ends(results: Results, rows: tuple[str, ...]) -> Any:
         seeds = seeds_in_words(len(entries))
         words = "no finished runs yet" if share is None else f"{100 * share:.0f} % in the circle, {seeds}"
         ax.set_title(f"{row.removeprefix('maze/')}\n{words}", fontsize=8)
+    end = Line2D([], [], marker=".", ls="", color="#0072B2", label="end of an episode")
+    figure.legend(handles=[*_places(), end], loc="outside lower center", ncols=3)
     return figure

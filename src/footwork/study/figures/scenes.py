@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Polygon
 
 from footwork.arena import DIRECTIONS, Arena, bandit, extent_of
-from footwork.palette import DIRECTION_COLOURS, rgb
+from footwork.palette import DIRECTION_COLOURS, GOAL_COLOUR, rgb
 from footwork.render import GLPainter, Shot, View, choose_platform, project, standing
 from footwork.study.experiments import ANT_BANDIT, ANT_MAZE, ANT_WALKER
 from footwork.study.results import Results
@@ -21,7 +21,7 @@ _LEGS = ((1, 1), (-1, 1), (-1, -1), (1, -1))  # as in assets/ant.xml
 _KNEE = math.radians(62.0)  # how far the shins bend down
 _SHIN = 0.4 * math.sqrt(2)  # m
 _LIMB, _TORSO = "#D98E4A", "#C4752F"
-_FLOOR, _GRID, _GOAL = "#F3F1EB", "#DEDAD0", "#D55E00"
+_FLOOR, _GRID = "#F3F1EB", "#DEDAD0"
 
 
 class _View:
@@ -107,7 +107,7 @@ def _walls(ax: Any, view: _View, arena: Arena, height: float) -> None:
 
 def _orb(ax: Any, view: _View, x: float, y: float, z: float, radius: float, faint: bool = False) -> Any:
     centre = view.flat((x, y, z))
-    ax.add_patch(Circle(centre, radius, fc=_GOAL, ec="#7A3200", lw=0.8, alpha=0.45 if faint else 1.0, zorder=9))
+    ax.add_patch(Circle(centre, radius, fc=GOAL_COLOUR, ec="#7A3200", lw=0.8, alpha=0.45 if faint else 1.0, zorder=9))
     ax.add_patch(Circle(centre + radius * np.array([-0.3, 0.35]), 0.3 * radius, fc="white", alpha=0.5, zorder=9.1))
     return centre
 
@@ -163,7 +163,7 @@ def _photographed_walker(platform: str) -> Any:
         unit = np.array([math.cos(i * math.pi / 2), math.sin(i * math.pi / 2)])
         photograph.arrow((*1.0 * unit, 0.02), (*1.75 * unit, 0.02), color=DIRECTION_COLOURS[i])
         photograph.word(name, *2.05 * unit, 0.02, color=DIRECTION_COLOURS[i])
-    photograph.word("target of “right”: (10 km, 0) →", 2.6, 0.45, 0.02, color=_GOAL, fontsize=8)
+    photograph.word("target of “right”: (10 km, 0) →", 2.6, 0.45, 0.02, color=GOAL_COLOUR, fontsize=8)
     return photograph.figure
 
 
@@ -198,7 +198,7 @@ def _photographed_bandit(platform: str) -> Any:
     )
     for number, (x, y) in enumerate(ANT_BANDIT.arena.goals):
         words, height = ("this episode's goal", 3.2) if number == 0 else ("not this time", 0.0)
-        photograph.word(words, x, y, height, color=_GOAL if number == 0 else "#6A6458", fontsize=8)
+        photograph.word(words, x, y, height, color=GOAL_COLOUR if number == 0 else "#6A6458", fontsize=8)
     photograph.word(f"{2 * corners[0][0]:.0f} m", 0.0, -corners[0][1], 0.0, color="#6A6458", fontsize=8)
     return photograph.figure
 
@@ -232,9 +232,12 @@ def _photographed_maze(platform: str) -> Any:
     arena = ANT_MAZE.arena
     photograph = _Photograph(ANT_MAZE, extent_of(arena), (1280, 1000), platform)
     (start_x, start_y), (goal_x, goal_y) = arena.start, arena.goals[0]
-    photograph.word("goal", goal_x + 1.4, goal_y, 0.0, color=_GOAL)
+    photograph.word("goal", goal_x + 1.4, goal_y, 0.0, color=GOAL_COLOUR)
     photograph.word("start", start_x, start_y - 1.3, 0.0, color="#444444")
-    photograph.arrow((start_x, start_y + 0.7, 0.6), (goal_x, goal_y - 0.6, 0.6), color=_GOAL, lw=1.4, ls=":")
+    line = np.array([photograph.at(start_x, start_y + 0.9, 0.6), photograph.at(goal_x, goal_y - 0.9, 0.6)])
+    photograph.ax.plot(*line.T, color=GOAL_COLOUR, lw=1.4, ls=":")
+    photograph.arrow((goal_x, goal_y - 0.9, 0.6), (goal_x, goal_y - 0.6, 0.6), color=GOAL_COLOUR, lw=1.4)
+    photograph.word("tiles of 2 m", 0.0, -1.4 * arena.cell, 0.0, color="#6A6458", fontsize=8)
     return photograph.figure
 
 
@@ -250,7 +253,7 @@ def _drawn_maze() -> Any:
     goal = arena.goals[0]
     _orb(ax, view, *goal, 0.6, 0.5)
     start, end = view.flat((*arena.start, 0.3)), view.flat((*goal, 0.3))
-    ax.plot(*np.stack([start, end]).T, color=_GOAL, ls=":", lw=1.6, zorder=8)
+    ax.plot(*np.stack([start, end]).T, color=GOAL_COLOUR, ls=":", lw=1.6, zorder=8)
     ax.text(*(view.flat((goal[0] + 0.9, goal[1], 0.5))), "goal", fontsize=9, weight="bold", va="center", zorder=30)
     ax.text(*(view.flat((arena.start[0] + 1.5, arena.start[1], 0.4))), "start", fontsize=9, va="center", zorder=30)
     return figure
@@ -265,13 +268,14 @@ def hierarchy(results: Results, rows: tuple[str, ...]) -> Any:
     for i, name in enumerate(DIRECTIONS):
         x = 2.2 + 3.95 * i
         _box(ax, x, 4.4, 3.5, 1.4, f"sub-policy {name}", "frozen", "#FFFFFF", DIRECTION_COLOURS[i])
-        _arrow(ax, (9.8, 7.5), (x + 1.75, 5.9), DIRECTION_COLOURS[i])
-        _arrow(ax, (x + 1.75, 4.3), (9.8, 2.7), DIRECTION_COLOURS[i])
+        _arrow(ax, (7.4 + 1.6 * i, 7.5), (x + 1.75, 5.9), DIRECTION_COLOURS[i])
+        _arrow(ax, (x + 1.75, 4.3), (7.4 + 1.6 * i, 2.7), DIRECTION_COLOURS[i])
+        _route(ax, [(x + 3.0, 3.85), (x + 3.0, 4.33)])
     _box(ax, 5.2, 0.9, 9.2, 1.6, "ant in its task", "8 torques every control step (16.5 ms)", "#FBF3EA", _LIMB)
     _route(ax, [(5.1, 1.7), (1.2, 1.7), (1.2, 8.4), (5.1, 8.4)])
     ax.text(1.4, 9.15, "all observations\n(34 or 36)", fontsize=8, va="center", color="#555555")
     ax.text(1.4, 7.8, "sum of k rewards", fontsize=8, va="center", color="#555555")
-    _route(ax, [(14.5, 1.7), (18.9, 1.7), (18.9, 5.1), (17.6, 5.1)])
+    ax.plot([14.5, 18.9, 18.9, 5.2], [1.7, 1.7, 3.85, 3.85], color="#777777", lw=1.1, ls="--", zorder=0)
     ax.text(14.8, 1.1, "first 32 observations, to each", fontsize=8, va="center", color="#555555")
     return figure
 

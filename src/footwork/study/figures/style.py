@@ -14,7 +14,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from footwork.study.results import Results
+from footwork.study.results import Results, seeds_in_words
 
 DPI = 160
 WIDTH = 7.2  # inches, of a page
@@ -34,27 +34,26 @@ _RC: dict[Any, Any] = {
 
 
 class Look(NamedTuple):
-    """Of a row, wherever it is drawn: Okabe and Ito's colours, and a line and a mark of its own."""
+    """Of a row, wherever it is drawn: a colour (Okabe and Ito's, and darker ones) and a mark of its own."""
 
     colour: str
-    line: Any
     mark: str
 
 
 LOOKS: dict[str, Look] = {
-    "plain": Look("#000000", "-", "o"),
-    "random-start": Look("#E69F00", (0, (5, 1)), "s"),
-    "random-repeated": Look("#56B4E9", (0, (3, 1, 1, 1)), "^"),
-    "appropriate-bias": Look("#0072B2", (0, (7, 2)), "D"),
-    "interleaved": Look("#009E73", "-", "v"),
-    "symmetric": Look("#CC79A7", (0, (1, 1)), "P"),
-    "symmetric-interleaved": Look("#D55E00", (0, (4, 1, 1, 1, 1, 1)), "X"),
-    "free": Look("#7A7A7A", (0, (2, 2)), "<"),
-    "penalised": Look("#332288", (0, (4, 1, 1, 1)), ">"),
-    "guided-free": Look("#A6761D", (0, (2, 2)), "<"),
-    "guided-penalised": Look("#882255", (0, (4, 1, 1, 1)), ">"),
+    "plain": Look("#000000", "o"),
+    "random-start": Look("#E69F00", "s"),
+    "random-repeated": Look("#56B4E9", "^"),
+    "appropriate-bias": Look("#0072B2", "D"),
+    "interleaved": Look("#009E73", "v"),
+    "symmetric": Look("#CC79A7", "P"),
+    "symmetric-interleaved": Look("#D55E00", "X"),
+    "free": Look("#7A7A7A", "<"),
+    "penalised": Look("#332288", ">"),
+    "guided-free": Look("#A6761D", "*"),
+    "guided-penalised": Look("#882255", "p"),
 }
-_OTHER = Look("#444444", "-", ".")
+_OTHER = Look("#444444", ".")
 
 
 def look_of(row: str) -> Look:
@@ -68,26 +67,28 @@ def label_of(row: str) -> str:
     return f"flat, {last}" if "/flat/" in row else last
 
 
-def labels_of(results: Results, rows: Iterable[str], named: Callable[[str], str] = label_of) -> dict[str, str]:
-    """What each row with runs is called in a legend, with its seeds: every number of them where rows share a name."""
-    seeds = {row: count for row in rows if (count := len(results.samples(row)))}
-    together: dict[str, list[int]] = {}
-    for row, count in seeds.items():
-        together.setdefault(named(row), []).append(count)
-    return {row: f"{named(row)} (n = {', '.join(map(str, dict.fromkeys(together[named(row)])))})" for row in seeds}
+def seeds_of(results: Results, rows: Iterable[str]) -> str:
+    """How many seeds stand behind the rows of a panel that have any: ``10 seeds``, ``2 to 10 seeds``."""
+    counts = sorted({count for row in rows if (count := len(results.samples(row)))})
+    return seeds_in_words(" to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))) if counts else ""
 
 
-def log_axis(ax: Any, ticks: Sequence[float], words: Callable[[float], str], low: float, high: float) -> None:
-    """A logarithmic x axis with ticks that are read as numbers."""
+def log_axis(ax: Any, words: Callable[[float], str], decades: float) -> None:
+    """A logarithmic x axis as long as what is drawn, at most so many powers of ten; ticks read as numbers."""
     ax.set_xscale("log")
-    ax.set_xticks(list(ticks), [words(tick) for tick in ticks])
     ax.minorticks_off()
-    ax.set_xlim(low, high)
+    high, first = ax.dataLim.x1, ax.dataLim.minposx
+    if not np.isfinite(first) or high <= 0:
+        return
+    low = max(first, high / 10**decades)
+    ticks = [m * 10.0**e for e in range(-4, 9) for m in (1, 3) if low <= m * 10.0**e <= 1.001 * high]
+    ax.set_xticks(ticks, [words(tick) for tick in ticks])
+    ax.set_xlim(low, 1.05 * high)
 
 
 def count_in_words(steps: float) -> str:
-    """``30 k``, ``3 M``."""
-    return f"{steps / 1e6:g} M" if steps >= 1e6 else f"{steps / 1e3:g} k"
+    """``300``, ``30 k``, ``3 M``."""
+    return f"{steps / 1e6:g} M" if steps >= 1e6 else f"{steps / 1e3:g} k" if steps >= 1e3 else f"{steps:g}"
 
 
 @contextmanager
@@ -142,7 +143,6 @@ def interval_marks(ax: Any, x: Sequence[float], effects: Sequence[Any], look: Lo
         middle,
         yerr=np.maximum([below, above], 0.0),
         color=look.colour,
-        ls=look.line,
         marker=look.mark,
         ms=4.5,
         lw=1.3,

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from footwork.study.experiments import is_row
+from footwork.study.experiments import SCHEDULES, WALKERS, is_row
 from footwork.study.figures import curves, measures, paths, scenes
 from footwork.study.figures.style import save, styled
 from footwork.study.results import Results
 
-_KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias", "interleaved")
-_ALL_KINDS = (*_KINDS, "symmetric", "symmetric-interleaved")
-_SCHEDULES = ("paper", "hrl")
+_ALL_KINDS = tuple(row.name.removeprefix("walker/") for row in WALKERS)
+_KINDS = tuple(kind for kind in _ALL_KINDS if not kind.startswith("symmetric"))
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class Figure:
     Args:
         name: its file's name, and what the command line calls it.
         title: one line.
-        caption: how to read it.
+        caption: how to read it; names in braces stand for what depends on the study's size.
         draw: from the results and the rows, a matplotlib figure.
         rows: that it reads.
         paper: the figure of the paper that it answers, if any.
@@ -51,14 +50,12 @@ class Drawn(NamedTuple):
 
 def _against_flat(place: str) -> tuple[str, ...]:
     kinds = ("appropriate-bias", "interleaved", "symmetric-interleaved")
-    masters = [f"{place}/{schedule}/{kind}" for schedule in _SCHEDULES for kind in kinds]
+    masters = [f"{place}/{schedule}/{kind}" for schedule in SCHEDULES for kind in kinds]
     flats = [f"{place}/flat/{name}" for name in ("free", "penalised", "guided-free", "guided-penalised")]
     return (*masters, *flats)
 
 
-def _on_kinds(
-    place: str, kinds: tuple[str, ...] = _ALL_KINDS, schedules: tuple[str, ...] = _SCHEDULES
-) -> tuple[str, ...]:
+def _on_kinds(place: str, kinds: tuple[str, ...] = _ALL_KINDS, schedules: Iterable[str] = SCHEDULES) -> tuple[str, ...]:
     return tuple(f"{place}/{schedule}/{kind}" for schedule in schedules for kind in kinds)
 
 
@@ -66,12 +63,12 @@ def _walkers(kinds: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"walker/{kind}" for kind in kinds)
 
 
-_BANDS = "Interquartile mean over seeds, pointwise 95 % bootstrap bands; n is the number of seeds."
+_BANDS = "Interquartile mean over seeds, pointwise 95 % bootstrap bands."
 _REWARD = (
     "Only the distance part of the reward, as the paper plots, in shares of the whole way and averaged over the last "
     "twentieth of the training each time. Left along the straight line; right, on AntMaze, along the shortest way "
     "around the walls, so that the two panels differ in what is measured. An episode that ends in the goal circle does "
-    f"not quite reach 1. Sub-policies' own training (4 to 8 M control steps) is not on the axis. {_BANDS}"
+    f"not quite reach 1. Sub-policies' own training ({{own_steps}} control steps) is not on the axis. {_BANDS}"
 )
 
 FIGURES: tuple[Figure, ...] = (
@@ -155,7 +152,7 @@ FIGURES: tuple[Figure, ...] = (
         "11-handovers",
         "Hand-overs: from each direction to each",
         "Upper number: per cent of hand-overs without fall or flip, at 0.5 m/s or more; lower: mean speed after (m/s). "
-        "Means over seeds, 32 ants per pair and seed.",
+        "Interquartile means over seeds, {pairs} ants per pair and seed.",
         measures.handover_maps,
         _walkers(_ALL_KINDS),
     ),
@@ -170,8 +167,9 @@ FIGURES: tuple[Figure, ...] = (
         "13-option-length",
         "The length k of an option",
         "IQM over seeds with 95 % intervals, masters on interleaved sub-policies. Control steps and decisions per "
-        "update are the same everywhere, so that a longer option leaves a master fewer updates (on AntMaze 781 at "
-        "k = 10, 19 at k = 400).",
+        "update are the same everywhere, so that a longer option leaves a master fewer updates (on AntMaze "
+        "{updates_10} at k = 10, {updates_400} at k = 400). maze/k-paper: with the paper's reward and schedule, else "
+        "with ours.",
         measures.k_grids,
         measures.rows_of_grids("k"),
         once=True,
@@ -188,7 +186,7 @@ FIGURES: tuple[Figure, ...] = (
         "15-success",
         "Success in training, against steps and against wall time",
         "Share of the episodes that end in the goal, over the last twentieth of the training each time; sub-policies' "
-        f"own training (4 to 8 M control steps, some 6 minutes) not counted. {_BANDS}",
+        f"own training ({{own_steps}} control steps) not counted. {_BANDS}",
         curves.success_curves,
         (
             *_on_kinds("bandit", schedules=("hrl",)),
@@ -202,7 +200,8 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "16-paths",
         "Paths through the maze",
-        "Twelve episodes of the first seed; a master's coloured by the sub-policy in use, a flat policy's grey.",
+        "Twelve episodes of the first seed; a master's coloured by the sub-policy in use, a flat policy's grey. "
+        "Straight pieces join the places of a master's decisions, k control steps apart, and may cut corners.",
         paths.maze_paths,
         (
             *(f"maze/hrl/{kind}" for kind in ("plain", "appropriate-bias", "interleaved", "symmetric-interleaved")),
@@ -220,7 +219,8 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "18-profiles",
         "Performance profiles",
-        "How many runs get farther than each share of the way.",
+        "Share of runs (seeds) that get farther than each share of the straight-line way, with pointwise 95 % "
+        "bootstrap bands.",
         measures.profiles,
         (
             *_on_kinds("bandit", _KINDS, ("hrl",)),
@@ -232,7 +232,8 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "19-choices",
         "What the paper leaves open: B, the potential, the ant; and annealing",
-        "IQM over seeds with 95 % intervals; n is the number of seeds. Way: along the straight line.",
+        "IQM over seeds with 95 % intervals; in brackets the number of seeds. There are walls to go around on AntMaze "
+        "only.",
         measures.comparisons,
         measures.COMPARED,
         once=True,
@@ -246,7 +247,7 @@ FIGURES: tuple[Figure, ...] = (
         tuple(
             f"{place}/{schedule}{penalised}/{kind}"
             for place in ("bandit", "maze")
-            for schedule in _SCHEDULES
+            for schedule in SCHEDULES
             for kind in ("appropriate-bias", "plain")
             for penalised in ("", "-penalised")
         ),

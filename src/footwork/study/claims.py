@@ -1,6 +1,6 @@
 """The paper's claims and ours, written down before the runs: rows of data, and the rules that decide them.
 
-A claim compares rows of the table in a metric (:data:`footwork.study.results.METRICS`).
+A claim compares rows of the table in a metric (:data:`footwork.study.metrics.METRICS`).
 Each comparison is a contrast of interquartile means over seeds with a 95 % stratified-bootstrap
 interval; masters that stand on the same sub-policies are drawn together. Rules, where E is the
 estimate, [L, U] the interval and m the smallest difference that matters:

@@ -507,7 +507,6 @@ def test_masters_on_the_same_sub_policies_are_compared_seed_by_seed(study):
     plain = next(f for f in found if f.contrast.words == "bandit, plain" and f.contrast.metric == "way")
     assert plain.effect == pytest.approx((-0.03, -0.03, -0.03))
     assert plain.verdict == "holds"
-    assert plain.apart.low < -0.1  # with seeds from 0.2 to 0.9, nothing could be said
     exactly(fake_run(study, "bandit/paper/plain", 10), 0.1)  # has no counterpart, and is left out by name
     held = results.Results(study)
     found = next(j for j in claims.judge_all(held) if j.claim.number == 13 and j.setting.schedule == "paper").findings

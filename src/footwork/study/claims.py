@@ -2,8 +2,8 @@
 
 A claim compares rows of the table in a metric (:data:`footwork.study.metrics.METRICS`).
 Each comparison is a contrast of interquartile means over seeds with a 95 % stratified-bootstrap
-interval; masters that stand on the same sub-policies are drawn together. Rules, where E is the
-estimate, [L, U] the interval and m the smallest difference that matters:
+interval, whole seeds drawn within each row. Rules, where E is the estimate, [L, U] the interval
+and m the smallest difference that matters:
 
 ==============  =========================  ================================
 rule            holds                      does not hold
@@ -64,6 +64,7 @@ class Contrast:
         bound: the smallest difference that matters, or the threshold of ``at least`` and ``at most``.
         statistic: of each row's scores: the IQM, or the spread across seeds.
         decides: otherwise it is only shown.
+        paired: rows that stand on the same sub-policies are compared seed by seed: their seeds are drawn together.
     """
 
     words: str
@@ -74,6 +75,7 @@ class Contrast:
     bound: float
     statistic: Literal["iqm", "spread"] = "iqm"
     decides: bool = True
+    paired: bool = False
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,6 @@ class Finding:
     verdict: Verdict
     so_far: Verdict  # what the rule says if the number of seeds is not asked for
     room: float | None = None  # the most that a difference of shares could be: what the other row leaves
-    apart: Effect | None = None  # of rows whose seeds were drawn together: as if they were independent
 
 
 @dataclass(frozen=True)
@@ -145,8 +146,8 @@ def _way(words: str, one: str, other: str, decides: bool = True) -> Contrast:
     return _greater(words, one, other, "way", 0.05, decides)
 
 
-def _same_way(words: str, one: str, other: str, rule: Rule) -> Contrast:
-    return Contrast(words, (one, other), (1, -1), "way", rule, 0.05)
+def _same_way(words: str, one: str, other: str, rule: Rule, paired: bool = False) -> Contrast:
+    return Contrast(words, (one, other), (1, -1), "way", rule, 0.05, paired=paired)
 
 
 def _shown_too(contrasts: tuple[Contrast, ...]) -> tuple[Contrast, ...]:
@@ -304,8 +305,9 @@ CLAIMS: tuple[Claim, ...] = (
                 "greater",
                 0.05,
                 decides=not how,
+                paired="seed by seed" in how,
             )
-            for metric, how in (("way", ""), ("success", ", success"))
+            for metric, how in (("way", ""), ("way", ", seed by seed"), ("success", ", success"))
         ),
         everywhere=True,
     ),
@@ -364,6 +366,7 @@ CLAIMS: tuple[Claim, ...] = (
                         f"{place}/{{schedule}}-penalised/{kind}",
                         f"{place}/{{schedule}}/{kind}",
                         "same",
+                        paired=True,  # decided before a penalised master was trained
                     )
                     for kind in ("appropriate-bias", "plain")
                 )
@@ -480,8 +483,8 @@ def _overall(verdicts: list[Verdict]) -> Verdict:
 def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> Finding:
     rows = tuple(setting.fill(row) for row in what.rows)
     by_seed = [results.scores_by_seed(row, what.metric) if is_row(row) else {} for row in rows]
-    stands_on = [_stands_on(row) if is_row(row) else row for row in rows]
-    by_seed = _in_pairs(results, rows, stands_on, by_seed)
+    stands_on = [_stands_on(row) if what.paired and is_row(row) else row for row in rows]
+    by_seed = _in_pairs(results, claim, rows, stands_on, by_seed)
     scores = [np.array(list(score.values()), np.float64) for score in by_seed]
     seeds = tuple(len(score) for score in scores)
     if not all(seeds):
@@ -490,14 +493,12 @@ def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> F
     generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
     units = [[(row, seed) for seed in score] for row, score in zip(stands_on, by_seed, strict=True)]
     effect = contrast(scores, what.weights, generator, statistic, units=units)
-    together = len(set(stands_on)) < len(rows)
-    apart = contrast(scores, what.weights, generator, statistic) if together else None
     so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"
     verdict = so_far if min(seeds) >= claim.min_seeds else "undecided"
     room = None
     if METRICS[what.metric].is_share and what.rule == "greater" and what.weights == (1, -1):
         room = 1.0 - float(overall_iqm(as_scores(scores[1])))
-    return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far, room, apart)
+    return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far, room)
 
 
 def _stands_on(row: str) -> str:
@@ -506,7 +507,7 @@ def _stands_on(row: str) -> str:
 
 
 def _in_pairs(
-    results: Results, rows: Sequence[str], stands_on: Sequence[str], by_seed: Sequence[dict[int, Any]]
+    results: Results, claim: Claim, rows: Sequence[str], stands_on: Sequence[str], by_seed: Sequence[dict[int, Any]]
 ) -> list[dict[int, Any]]:
     """Of rows that stand on the same runs and have different seeds, those that all of them have; the others are named.
 
@@ -518,7 +519,10 @@ def _in_pairs(
         alone = sorted(seed for seed in scores if not all(seed in other for other in partners))
         if alone:
             seeds = ", ".join(map(str, alone))
-            results.problems[f"{row}: seeds without a counterpart are left out of paired comparisons: {seeds}"] = None
+            said = (
+                f"claim {claim.number} compares {row} seed by seed, and leaves out those without a counterpart: {seeds}"
+            )
+            results.problems[said] = None
         paired.append({seed: score for seed, score in scores.items() if seed not in alone})
     return paired
 
@@ -562,14 +566,14 @@ def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
         turned = [f.contrast.words for f in decisive if is_reversed(f)]
         said += [f"the other way round: {', '.join(turned)}"] if turned else []
         said += [f"no runs of {missing}"] if missing else []
-        return "; ".join([*said, *_no_room(deciding), *_drawn_apart(deciding)])
+        return "; ".join([*said, *_no_room(deciding)])
     if missing:
         return f"no runs of {missing}"
     fewest = min(min(f.seeds) for f in deciding)
     if fewest < claim.min_seeds:
         so_far = _overall([f.so_far for f in deciding])
         return f"{seeds_in_words(fewest)}, {claim.min_seeds} are asked for; so far: {so_far}"
-    return "; ".join(["the interval allows both", *_no_room(deciding), *_drawn_apart(deciding)])
+    return "; ".join(["the interval allows both", *_no_room(deciding)])
 
 
 def _no_room(deciding: list[Finding]) -> list[str]:
@@ -578,15 +582,6 @@ def _no_room(deciding: list[Finding]) -> list[str]:
         f"{f.contrast.words}, no more than {100 * f.room:.1f} points were possible"
         for f in deciding
         if f.room is not None and f.room < f.contrast.bound
-    ]
-
-
-def _drawn_apart(deciding: list[Finding]) -> list[str]:
-    """Comparisons of masters on the same sub-policies that would be decided otherwise if they were independent."""
-    return [
-        f"{f.contrast.words} with seeds drawn apart {_in_brackets(f, f.apart)}: {otherwise}"
-        for f in deciding
-        if f.apart is not None and (otherwise := decide(f.contrast.rule, f.contrast.bound, f.apart)) != f.so_far
     ]
 
 

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from footwork.arena import DIRECTIONS, shortest_path
 from footwork.palette import DIRECTION_COLOURS
-from footwork.statistics import DRAWS, Floats, curve_band, generator_for
+from footwork.statistics import Floats, curve_band, generator_for
 from footwork.study.experiments import SCHEDULES, find_row
 from footwork.study.figures.style import (
     count_in_words,
@@ -91,7 +91,7 @@ def draw_curve(
     if found is None:
         return False
     x, y = found
-    middle, (low, high) = curve_band(y, generator_for(f"curve {name}"), DRAWS)
+    middle, (low, high) = curve_band(y, generator_for(f"curve {name}"))
     first = zlib.crc32(label.encode()) % _MARKED  # not every row's marks at the same places
     style = {"marker": mark, "ms": 4.0, "markevery": (first, _MARKED)} if mark else {}
     ax.plot(x, middle, color=colour, ls=line, lw=1.4, label=label, **style)

@@ -208,15 +208,23 @@ def test_what_does_not_count_is_left_out_by_name(study):
     config = json.loads((paths[2] / "config.json").read_text())
     config["config"]["experiment"]["task"]["xy_scale"] = 0.5
     write(paths[2] / "config.json", config)
-    write(paths[3] / "DONE", {"steps": 500_000})
+    write(paths[3] / "DONE", {"row": row, "seeds": [3], "steps": 500_000})
     config = json.loads((paths[4] / "config.json").read_text())
     config["config"]["experiment"]["wings"] = 2
     config["versions"]["footwork"] = "9.9"
     write(paths[4] / "config.json", config)
     shutil.copytree(paths[5], paths[5].with_name("seeds-5"))
     write(fake_run(study, row, 6) / "DONE", {})
+    for name in ("DONE", "evaluation.json"):  # of another row, and whole
+        shutil.copy(fake_run(study, "maze/flat/penalised", 7) / name, fake_run(study, row, 7 if name == "DONE" else 8))
+        shutil.rmtree(study.runs / "maze/flat/penalised")
+    config = json.loads((fake_run(study, row, 9) / "config.json").read_text())
+    config["config"]["seeds"] = []
+    write(study.runs / row / "seed-9/config.json", config)
+    (study.runs / row / "seed-10").write_text("no folder")
     found = results.Results(study)
-    assert [sample.seed for sample in found.samples(row)] == [0, 5]
+    assert [sample.seed for sample in found.samples(row)] == [0, 5, 8]
+    assert len(found.scores(row, "way")) == 2
     for words in (
         "seed-1 is not finished",
         "seed-2 was trained with other fields than maze/flat/free",
@@ -224,9 +232,13 @@ def test_what_does_not_count_is_left_out_by_name(study):
         "seed-4 is of another version of footwork (9.9)",
         f"seeds-5: seed 5 is in {paths[5]} too",
         "seed-6/DONE is damaged or of another version of footwork: it does not say steps",
+        "seed-7/DONE is of maze/flat/penalised seeds [7], the run was begun as maze/flat/free [7]",
+        "seed-8/evaluation.json is of maze/flat/penalised, the run is of maze/flat/free",
+        "seed-9 is of another version of footwork (0.1.0): its seeds are []",
+        "seed-10 is a file where a folder of runs was to be",
     ):
         assert any(words in problem for problem in found.problems), words
-    assert [sample.seed for sample in results.Results(study, any_length=True).samples(row)] == [0, 3, 5]
+    assert [sample.seed for sample in results.Results(study, any_length=True).samples(row)] == [0, 3, 5, 8]
 
 
 @pytest.mark.parametrize(
@@ -246,9 +258,21 @@ def test_what_does_not_count_is_left_out_by_name(study):
             "of another version of footwork: it does not say fall_rate",
         ),
         (lambda path: with_entry(path, success={}), "of another version of footwork: it does not say 0.45"),
-        (lambda path: with_entry(path, way="far"), "is damaged: not every number in it is one"),
-        (lambda path: with_entry(path, ends=[[1.0, 2.0], [3.0]]), "is damaged: not every number in it is one"),
-        (lambda path: with_entry(path, paths=[{"xy": 3, "choices": []}]), "is damaged: not every number in it is one"),
+        (lambda path: with_entry(path, way="far"), "is damaged: a number in it is none, or out of its bounds"),
+        (lambda path: path.write_text("[" * 100_000), "is truncated or damaged"),
+        (lambda path: with_entry(path, ends=[[1.0, float("nan")]]), "a number in it is none, or out of its bounds"),
+        (lambda path: with_entry(path, way=7), "a number in it is none, or out of its bounds"),
+        (lambda path: with_entry(path, way=True), "a number in it is none, or out of its bounds"),
+        (lambda path: with_entry(path, stuck=None), "a number in it is none, or out of its bounds"),
+        (lambda path: with_entry(path, speed_mps={}, ends=None), "a number in it is none, or out of its bounds"),
+        (
+            lambda path: with_entry(path, ends=[[1.0, 2.0], [3.0]]),
+            "is damaged: a number in it is none, or out of its bounds",
+        ),
+        (
+            lambda path: with_entry(path, paths=[{"xy": 3, "choices": []}]),
+            "is damaged: a number in it is none, or out of its bounds",
+        ),
         (lambda path: write(path, {**json.loads(path.read_text()), "by_seed": [3]}), "holds no entries"),
     ],
 )
@@ -259,13 +283,30 @@ def test_damaged_measurements_are_named_and_how_to_make_them_again(study, damage
     assert len(found.scores("maze/flat/free", "way")) == 0
     (problem,) = found.problems
     assert message in problem
-    assert "footwork reproduce --rows maze/flat/free makes it again" in problem
+    assert f"delete {path}, and footwork reproduce --rows maze/flat/free trains it again" in problem  # it has no policy
 
 
 def with_entry(path, **fields):
     content = json.loads(path.read_text())
     content["by_seed"][0] |= fields
     write(path, content)
+
+
+def test_a_damaged_matrix_of_hand_overs_is_named(study):
+    path = fake_run(study, "walker/plain", 0) / "transitions.json"
+    (entry,) = json.loads(path.read_text())["by_seed"]
+    cells = entry["handover"]
+    for damaged in (
+        {"handover": cells[:3]},
+        {"handover": [[{**cell, "success": -3} for cell in line] for line in cells]},
+        {"handover": [[{**cell, "success": "0.5"} for cell in line] for line in cells]},
+        {"switching": {}},
+        {"seed": 0.5},
+    ):
+        with_entry(path, **{**entry, **damaged})
+        found = results.Results(study)
+        assert len(found.scores("walker/plain", "handover")) == 0
+        assert any("transitions.json is damaged" in problem for problem in found.problems)
 
 
 @pytest.mark.parametrize("values", [[], {}, {"return": [[1.0]], "progress": [[1.0]], "success": [[1.0]]}, None])
@@ -337,9 +378,38 @@ def test_a_report_of_fewer_runs_never_replaces_one_of_more(study, tmp_path, caps
         assert run(command) == 1
         said = capsys.readouterr().err
         assert "it holds 2 finished runs that" in said
-        assert "walker/plain/seed-1 among them" in said
-        assert f"cp -r {to / 'results'} {few.runs}" in said
+        assert "lacks (walker/plain/seed-1)" in said
+        assert f"(mkdir -p {few.runs} && cp -rn {to / 'results'}/. {few.runs})" in said
     assert len(list((to / "results").rglob("DONE"))) == 3
+    shutil.copytree(to / "results", few.runs, dirs_exist_ok=True)  # what was advised, works
+    assert run(["report", "--runs", str(few.runs), "--to", str(to)]) == 0
+    for damage in ("config.json", "evaluation.json", "transitions.json"):
+        path = study.runs / "walker/plain/seed-2" / damage
+        whole = path.read_bytes()
+        path.write_bytes(whole[:50])
+        assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 1
+        assert re.search(r"would lose \d+ of its files, walker/plain/seed-2/", capsys.readouterr().err)
+        path.write_bytes(whole)
+    assert (to / "results/walker/plain/seed-2/config.json").read_bytes() == (
+        study.runs / "walker/plain/seed-2/config.json"
+    ).read_bytes()
+
+
+def test_studies_of_different_sizes_do_not_replace_each_other(study, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
+    fill(study, ("walker/plain",), 1)
+    assert run(["report", "--runs", str(study.runs), "--to", str(tmp_path / "out")]) == 0
+    quick = Study(tmp_path / "quick", QUICK)
+    plan.mark(quick)
+    fake_run(quick, "walker/plain", 0, size=QUICK)
+    assert run(["report", "--runs", str(quick.runs), "--to", str(tmp_path / "out")]) == 1
+    assert "is of the full study, not of the quick one" in capsys.readouterr().err
+    assert run(["report", "--runs", str(quick.runs), "--to", str(quick.runs)]) == 1
+    assert "is the folder of the runs" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    asked = ["reproduce", "--rows", "walker/plain", "--runs", str(study.runs), "--to", str(tmp_path / "file")]
+    assert run(asked) == 1  # before anything is trained
+    assert "cannot write" in capsys.readouterr().err
 
 
 def test_results_that_a_killed_report_had_put_aside_come_back(study, tmp_path, monkeypatch):
@@ -512,7 +582,7 @@ def test_masters_on_the_same_sub_policies_are_compared_seed_by_seed(study):
     found = next(j for j in claims.judge_all(held) if j.claim.number == 13 and j.setting.schedule == "paper").findings
     again = next(f for f in found if f.contrast.words == "bandit, plain" and f.contrast.metric == "way")
     assert (again.effect, again.seeds) == (plain.effect, (10, 10))
-    assert any("bandit/paper/plain: seeds without a counterpart" in problem for problem in held.problems)
+    assert any("claim 13 compares bandit/paper/plain seed by seed" in problem for problem in held.problems)
 
 
 def test_a_verdict_rests_on_what_decided_and_names_what_is_missing(study):
@@ -621,9 +691,10 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
         "footwork reproduce --rows walker/plain --seeds 2",
         "## Figures",
         "## Rows",
-        "seed-2 is not finished",
     ):
         assert words in text, words
+    assert "seed-2 is not finished" not in text  # "2 of 10" says it, now and when the report is made again
+    assert any("seed-2 is not finished" in problem for problem in found.problems)
     assert text.index("## Claims") < text.index("## The paper") < text.index("## Figures")
     assert not re.search(r'(src|href)="(?!data:)', page)  # nothing but what is in the page itself
     assert page.count("data:image/png;base64,") == 2

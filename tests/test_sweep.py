@@ -178,7 +178,7 @@ def test_a_sweep_that_is_asked_to_stop_lets_its_runs_save_and_says_how_to_go_on(
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=60)
     assert time.monotonic() - begun < 20  # the runs, of 30 s, did not have to be waited for
-    assert "SweepStopped: stopped: 0 of 8 runs done" in said
+    assert "SweepStopped: stopped: 0 of 8 runs done, 0 running" in said
     assert "call it again to go on" in said
     board = stage.run(workers=2)
     assert (len(board.done), board.failed) == (8, {})
@@ -251,7 +251,7 @@ def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
         tmp_path / "walker/symmetric/seeds-0-1", {"experiment": config_to_json(walkers.experiment), "seeds": [0, 1]}
     )
     run.save_policy(walkers.params, policy_meta(walkers.experiment, (0, 1), 0))
-    run.finish({"steps": walkers.experiment.total_steps})
+    run.finish({"row": walkers.experiment.name, "seeds": [0, 1], "steps": walkers.experiment.total_steps})
     job.complete(study, "bandit/hrl/symmetric", 1)
     master = RunDir.open_existing(run_path(tmp_path, "bandit/hrl/symmetric", (1,)))
     arrays, meta = checkpoint.load_arrays(master.path / NEEDED)
@@ -266,14 +266,16 @@ def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
     # and elsewhere, where only the small files of the report are
     results = Results(study)
     assert len(results.samples("walker/symmetric")) == 2
-    export(results, tmp_path / "copy")
-    job.complete(Study(tmp_path / "copy", size), "bandit/hrl/symmetric", 1)
-    again = checkpoint.load_arrays(run_path(tmp_path / "copy", "bandit/hrl/symmetric", (1,)) / "policy.safetensors")[0]
+    export(results, tmp_path / "out/copy")
+    job.complete(Study(tmp_path / "out/copy", size), "bandit/hrl/symmetric", 1)
+    again = checkpoint.load_arrays(
+        run_path(tmp_path / "out/copy", "bandit/hrl/symmetric", (1,)) / "policy.safetensors"
+    )[0]
     assert all((again[name] == array).all() for name, array in checkpoint.load_arrays(master.policy_path)[0].items())
     # of a row's first seed the report keeps a master too, with what it stands on
     assert len(results.samples("bandit/hrl/symmetric")) == 1
-    export(results, tmp_path / "whole")
-    kept = run_path(tmp_path / "whole", "bandit/hrl/symmetric", (1,))
+    export(results, tmp_path / "out/whole")
+    kept = run_path(tmp_path / "out/whole", "bandit/hrl/symmetric", (1,))
     small = find_trained(str(kept), tmp_path)
     assert small.params.keys() == {"actor"}
     assert (

@@ -148,7 +148,10 @@ class RunDir:
         Raises:
             RunError: config.json cannot be read.
         """
-        return dict(_read_object(self.path / "config.json").get("versions", {}))
+        versions = _read_object(self.path / "config.json").get("versions", {})
+        if not isinstance(versions, dict):
+            raise RunError(f"{self.path / 'config.json'} is damaged: its versions are not named")
+        return versions
 
     def summary(self) -> dict[str, Any]:
         """What :meth:`finish` was given.
@@ -500,7 +503,7 @@ def _read_object(path: Path) -> dict[str, Any]:
         value = json.loads(path.read_bytes())
     except OSError as error:
         raise RunError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError:
+    except (ValueError, RecursionError):  # the second: thousands of brackets
         value = None
     if not isinstance(value, dict):
         raise RunError(f"{path} is damaged: it holds no JSON object")

@@ -31,11 +31,11 @@ def reproduce(command: Reproduce) -> int:
         tables.show(tables.plan_table(jobs, size.name))
         return 0
     to = command.to or Path(f"report{ending}")
-    check_place(study.runs, to)
+    check_place(study, to)
     mark(study)
     board = run_study(study, jobs, command.workers, command.launcher, command.address, log=_say)
-    for job, reason in board.failed.items():
-        _say(f"{job.name}: FAILED: {reason}")
+    if board.failed:
+        _say(f"FAILED: {', '.join(job.name for job in board.failed)}; the reasons are above, and in {study.runs}/logs")
     status = report(study.runs, to, command=_line(command))
     return 1 if board.failed else status
 

@@ -43,8 +43,17 @@ def completed(study: Study, jobs: Sequence[Job]) -> tuple[set[Job], list[str]]:
         problems += [run.why for run in left_out if not run.unfinished]
         runs = {sample.seed: sample.run for sample in samples}
         mine = [job for job in jobs if job.row == row and job.seed in runs]
-        done |= {job for job in mine if measured(runs[job.seed], study.row(row), study.size)}
+        done |= {job for job in mine if _is_whole(runs[job.seed], study.row(row), study.size)}
     return done, problems
+
+
+def _is_whole(run: RunDir, experiment: Experiment, size: Size) -> bool:
+    """Whether a finished run has its measurements and its curve."""
+    try:
+        read_curve(run, experiment)
+    except RunError:
+        return False
+    return measured(run, experiment, size)
 
 
 def complete(study: Study, row: str, seed: int) -> None:
@@ -57,7 +66,8 @@ def complete(study: Study, row: str, seed: int) -> None:
     if run is None:
         run = _train(study, study.row(row), seed)
     with run.lock():
-        measure(run, study.size)
+        if not measured(run, study.row(row), study.size):
+            measure(run, study.size)
         read_curve(run, study.row(row))
 
 

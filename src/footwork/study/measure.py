@@ -10,6 +10,7 @@ checkpoints, are enough to draw and to judge it again.
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from footwork.arena import CLEARANCE, DIRECTIONS, Arena, inside_walls
 from footwork.checkpoint import write_atomically
 from footwork.evaluate import Episodes, play_episodes, transitions
 from footwork.record import RunDir, RunError, versions
+from footwork.study.experiments import find_row, is_row
 from footwork.study.plan import Size
 from footwork.study.runs import NEEDED, load_policies, load_run, one_seed
 from footwork.tasks.task import SUCCESS_RADII
@@ -28,6 +30,7 @@ EVALUATION, TRANSITIONS = "evaluation.json", "transitions.json"
 FORMAT = 1
 EVALUATION_SEED = 1_000_003  # of the episodes; the run's seed is added
 STUCK_WITHIN = 1.0  # m around the point where the straight line to the goal meets a wall
+_FASTEST, _FARTHEST = 100.0, 1e4  # m/s and m: beyond it no ant goes, and a number is damaged
 KEPT_PATHS = 12  # episodes per seed whose paths are kept
 _KEPT_POINTS = 100  # of a path, at most
 
@@ -43,75 +46,101 @@ def measured(run: RunDir, experiment: Experiment, size: Size) -> bool:
 
 
 def problem_with(run: RunDir, name: str, size: Size | None = None) -> str | None:
-    """What is wrong with a file of measurements; None if nothing is."""
+    """What is wrong with a file of measurements of a finished run; None if nothing is."""
     path = run.path / name
     try:
         content = json.loads(path.read_bytes())
     except FileNotFoundError:
         return f"{path} is missing"
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):  # the last: thousands of brackets
         return f"{path} is truncated or damaged"
     if not isinstance(content, dict) or content.get("format") != FORMAT or not content.get("by_seed"):
         return f"{path} is damaged or of another version of footwork"
-    if content.get("row") != run.summary().get("row"):
-        return f"{path} is of {content.get('row')}, the run is of {run.summary().get('row')}"
-    if content.get("steps") != run.summary().get("steps"):
-        return f"{path} is of a policy {content.get('steps')} steps old, the run has {run.summary().get('steps')}"
+    done = run.summary()
+    if content.get("row") != done.get("row"):
+        return f"{path} is of {content.get('row')}, the run is of {done.get('row')}"
+    if content.get("steps") != done.get("steps"):
+        return f"{path} is of a policy {content.get('steps')} steps old, the run has {done.get('steps')}"
     if size is not None and content.get("size") != size.name:
         return f"{path} is of the {content.get('size')} study, not of the {size.name} one"
-    return _malformed(path, content["by_seed"])
+    return _malformed(path, content["by_seed"], str(done.get("row")))
 
 
-def _malformed(path: Path, entries: Any) -> str | None:
+def _malformed(path: Path, entries: Any, row: str) -> str | None:
     """What is wrong with the entries of a file of measurements: whatever claims and figures read must be there."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         return f"{path} is damaged: it holds no entries"
-    for entry in entries:
-        try:
-            (_read_transitions if path.name == TRANSITIONS else _read_evaluation)(entry)
-        except KeyError as missing:
-            return f"{path} is of another version of footwork: it does not say {missing.args[0]}"
-        except (TypeError, ValueError, AttributeError):
-            return f"{path} is damaged: not every number in it is one"
+    experiment = find_row(row) if is_row(row) else None
+    try:
+        for entry in entries:
+            if path.name == TRANSITIONS:
+                _check_transitions(entry)
+            elif experiment is None or experiment.is_walker:
+                _check_walking(entry)
+            else:
+                _check_arriving(entry, experiment)
+        if len({entry["seed"] for entry in entries}) < len(entries):
+            return f"{path} is damaged: it has two entries of one seed"
+    except KeyError as missing:
+        return f"{path} is of another version of footwork: it does not say {missing.args[0]}"
+    except (TypeError, ValueError, AttributeError, OverflowError):
+        return f"{path} is damaged: a number in it is none, or out of its bounds"
     return None
 
 
-def _read_evaluation(entry: dict[str, Any]) -> None:
-    numbers = [entry["fall_rate"], entry["flip_rate"], entry["seed"]]
-    if "speed_mps" in entry:
-        numbers += [entry["speed_mps"][name] for name in DIRECTIONS]
-    else:
-        numbers += [entry["way"], *(entry["success"][str(radius)] for radius in SUCCESS_RADII)]
-        numbers += [] if entry["stuck"] is None else [entry["stuck"]]
-        for place in (entry["ends"], *(path["xy"] for path in entry["paths"])):
-            if np.array(place, np.float64).shape[1:] != (2,):
-                raise ValueError("places are pairs of numbers")
-        numbers += [choice for path in entry["paths"] for choice in path["choices"]]
-    _all_finite(numbers)
+def _check_walking(entry: dict[str, Any]) -> None:
+    _check([entry["seed"]], 0, math.inf, whole=True)
+    _check([entry["fall_rate"], entry["flip_rate"]], 0, 1)
+    _check([entry["speed_mps"][name] for name in DIRECTIONS], -_FASTEST, _FASTEST)
 
 
-def _read_transitions(entry: dict[str, Any]) -> None:
-    cells = [[(cell["success"], cell["speed_mps"]) for cell in line] for line in entry["handover"]]
-    if np.array(cells, np.float64).shape != (len(DIRECTIONS), len(DIRECTIONS), 2):
-        raise ValueError("not every direction to every direction")
-    figures = [found[name] for found in entry["switching"].values() for name in ("speed_mps", "idle", "upside_down")]
-    _all_finite([entry["seed"], *figures, *(int(period) for period in entry["switching"])])
+def _check_arriving(entry: dict[str, Any], experiment: Experiment) -> None:
+    _check([entry["seed"]], 0, math.inf, whole=True)
+    _check([entry["fall_rate"], entry["flip_rate"], *(entry["success"][str(r)] for r in SUCCESS_RADII)], 0, 1)
+    _check([entry["way"]], -_FARTHEST, 1)
+    if straight_line_stop(experiment.task.arena) is not None:
+        _check([entry["stuck"]], 0, 1)
+    for places in (entry["ends"], *(path["xy"] for path in entry["paths"])):
+        _check([number for place in places for number in place], -_FARTHEST, _FARTHEST)
+        if not places or any(len(place) != 2 for place in places):
+            raise ValueError("places are pairs of numbers")
+    for path in entry["paths"]:
+        _check(path["choices"], 0, len(DIRECTIONS) - 1, whole=True)
+        if experiment.is_master and len(path["choices"]) != len(path["xy"]) - 1:
+            raise ValueError("a choice for every piece of a path")
 
 
-def _all_finite(numbers: list[Any]) -> None:
-    if not np.isfinite(np.array(numbers, np.float64)).all():
-        raise ValueError("not finite")
+def _check_transitions(entry: dict[str, Any]) -> None:
+    _check([entry["seed"]], 0, math.inf, whole=True)
+    if [len(line) for line in entry["handover"]] != [len(DIRECTIONS)] * len(DIRECTIONS) or not entry["switching"]:
+        raise ValueError("from every direction to every direction, and switched at random")
+    cells = [cell for line in entry["handover"] for cell in line]
+    _check([cell["success"] for cell in cells], 0, 1)
+    figures = list(entry["switching"].values())
+    _check([found[name] for found in figures for name in ("idle", "upside_down")], 0, 1)
+    _check([found["speed_mps"] for found in (*cells, *figures)], -_FASTEST, _FASTEST)
+    _check([int(period) for period in entry["switching"]], 1, math.inf)
+
+
+def _check(numbers: Any, low: float, high: float, whole: bool = False) -> None:
+    """Refuse what is no number, or lies out of its bounds; NaN does."""
+    kinds = (int,) if whole else (int, float)
+    for number in numbers:
+        if type(number) not in kinds or not low <= number <= high:
+            raise ValueError(f"{number!r} is no number between {low} and {high}")
 
 
 def measure(run: RunDir, size: Size, num_threads: int = 1) -> None:
     """Make the files of a finished run that are missing, stale or damaged.
 
     Raises:
-        RunError: the run is not finished.
+        RunError: the run is not finished, or has no policy (a report keeps those of some seeds only).
         CheckpointError: its policy is damaged, or a file cannot be written.
     """
     if not run.finished:
         raise RunError(f"{run.path} is not finished: only finished runs are measured")
+    if not run.policy_path.is_file():
+        raise RunError(f"{run.path} has no policy to be measured with: delete that folder, and it is trained again")
     trained = load_run(run)
     makers = {EVALUATION: _evaluation, TRANSITIONS: _transitions}
     for name in files_of(trained.experiment):

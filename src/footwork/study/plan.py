@@ -184,7 +184,7 @@ def read_mark(runs: Path) -> Size:
         if content["format"] != _FORMAT:
             raise ValueError
         return SIZES[content["size"]]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise RunError(f"{path} is damaged or of another version of footwork") from None
 
 
@@ -200,7 +200,7 @@ def read_origin(runs: Path) -> Origin:
     try:
         content = json.loads((runs / STUDY_FILE).read_bytes())
         return Origin(str(content.get("machine", "")), str(content.get("commit", "")))
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return Origin("", "")
 
 

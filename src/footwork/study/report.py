@@ -39,9 +39,9 @@ from footwork.study.claims import (
 )
 from footwork.study.experiments import EXPERIMENTS, SCHEDULES, find_row, in_braces, is_row
 from footwork.study.figures import FIGURES, Drawn, count_in_words, draw_figures
-from footwork.study.measure import EVALUATION, TRANSITIONS
+from footwork.study.measure import files_of
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
-from footwork.study.plan import STUDY_FILE, default_rows, plan, read_origin
+from footwork.study.plan import STUDY_FILE, Study, default_rows, plan, read_mark, read_origin
 from footwork.study.results import Results, Sample, seeds_in_words
 from footwork.study.runs import read_actors
 from footwork.study.training_curves import CURVE, copy_curve
@@ -112,12 +112,12 @@ def write_report(results: Results, to: Path, command: str) -> list[Path]:
         OSError: it cannot be written.
         CheckpointError: it cannot be written.
     """
-    check_place(results.study.runs, to)
+    check_place(results.study, to)
     prefixes = prefixes_at_hand(results)
     for row in all_rows(results):
         results.samples(row)
+    export(results, to / RESULTS)  # first: it may refuse, and may find what is wrong with a file, which the pages say
     drawn = [one for prefix in prefixes for one in draw_figures(results, FIGURES, to / "figures", prefix)]
-    export(results, to / RESULTS)  # first: it may find what is wrong with a file, and the pages say so
     blocks = report_blocks(results, drawn, command)
     pages = {"REPORT.md": _markdown(blocks, to), "report.html": _page(blocks, _title(results))}
     for name, text in pages.items():
@@ -216,13 +216,12 @@ def _summary(results: Results, judgements: Sequence[Judgement], rows: Sequence[s
             name = str(claim.number) if alike else f"{claim.number} ({_SETTINGS[j.setting.schedule]})"
             groups.setdefault(standing, []).append(name)
     lines = [f"**{standing}**: {', '.join(groups[standing])}" for standing in _STANDINGS if standing in groups]
-    seeds = sum(len(results.samples(row)) for row in rows)
+    counted = sum(len(results.samples(row)) for row in rows)
+    seeds = f"{counted} run{'' if counted == 1 else 's'} of {len(rows)} row{'' if len(rows) == 1 else 's'}"
     length = " Runs of any length count." if results.any_length else ""
     default = find_row("walker/plain")
     where = f"{default.engine}, {default.task.robot.name} ant"
-    text = (
-        f"{len(CLAIMS)} claims, judged from {seeds} runs of {len(rows)} rows ({where} if not said otherwise).{length}"
-    )
+    text = f"{len(CLAIMS)} claims, judged from {seeds} ({where} if not said otherwise).{length}"
     elsewhere: dict[str, list[str]] = {}
     for j in judgements:
         if j.setting.prefix:
@@ -395,9 +394,12 @@ def _left_out(results: Results, drawn: Sequence[Drawn]) -> list[Block]:
             by_count.setdefault(f"{have} of {planned[row]}", []).append(row)
         said = "; ".join(f"{count}: {in_braces(group)}" for count, group in by_count.items())
         blocks.append(Text(f"Rows with fewer seeds than the study plans: {said}."))
-    if results.problems:
+    problems = [
+        problem for problem in results.problems if problem not in results.unfinished
+    ]  # those are rows with fewer
+    if problems:
         here = f"{results.study.runs}{os.sep}"
-        lines = tuple((problem.replace(here, ""),) for problem in results.problems)
+        lines = tuple((problem.replace(here, ""),) for problem in problems)
         blocks.append(TableBlock(("file or run",), lines))
     return blocks or [Text("Nothing.")]
 
@@ -435,15 +437,20 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     ]
 
 
-def check_place(runs: Path, to: Path) -> None:
-    """Refuse a folder for the report in which writing it would cost something that ``runs`` does not hold.
+def check_place(study: Study, to: Path) -> None:
+    """Refuse a folder for the report in which writing it would cost something that the study's runs do not hold.
 
     What a report that was killed in the middle had put aside is brought back first.
 
     Raises:
-        RunError: ``to``/results holds the runs, or something that no report wrote, or runs that ``runs`` lacks.
+        RunError: ``to`` is the folder of runs, or ``to``/results holds the runs, something that no report wrote,
+            another study, or runs that these lack.
+        CheckpointError: nothing can be written there.
     """
-    place = to / RESULTS
+    place, runs = to / RESULTS, study.runs
+    if runs.resolve() == to.resolve():
+        raise RunError(f"{to} is the folder of the runs: choose another --to for the report")
+    checkpoint.check_writable(to / "REPORT.md")
     aside = _beside(place)[1]
     if aside.exists() and not place.exists():
         aside.rename(place)
@@ -451,14 +458,22 @@ def check_place(runs: Path, to: Path) -> None:
         return
     if runs.resolve().is_relative_to(place.resolve()):
         raise RunError(f"{place} would be replaced, and the runs in {runs} are in it: choose another --to")
-    if place.exists() and not (place / WRITTEN).is_file() and (not place.is_dir() or any(place.iterdir())):
+    if not place.exists() or (place.is_dir() and not any(place.iterdir())):
+        return
+    if not (place / WRITTEN).is_file():
         raise RunError(f"{place} holds something that no report wrote (it has no {WRITTEN}): choose another --to")
+    if read_mark(place) != study.size:
+        raise RunError(
+            f"{place} is of the {read_mark(place).name} study, not of the {study.size.name} one: choose another --to"
+        )
     there = sorted(path.parent.relative_to(place) for path in place.rglob("DONE"))
     lost = [path for path in there if not (runs / path / "DONE").is_file()]
     if lost:
+        many = f"{len(lost)} finished runs" if len(lost) > 1 else "a finished run"
+        copy = f"mkdir -p {runs} && cp -rn {place}/. {runs}"
         raise RunError(
-            f"{place} would be replaced, and it holds {len(lost)} finished runs that {runs} lacks, {lost[0]} among "
-            f"them: copy them there to go on with that study (all: cp -r {place} {runs}), or choose another --to"
+            f"{place} would be replaced, and it holds {many} that {runs} lacks ({lost[0]}): to go on with that study "
+            f"copy what is missing ({copy}), else choose another --to"
         )
 
 
@@ -481,7 +496,7 @@ def export(results: Results, to: Path) -> None:
         OSError: they cannot be written.
         CheckpointError: they cannot be written.
     """
-    check_place(results.study.runs, to.parent)
+    check_place(results.study, to.parent)
     if to.resolve() == results.study.runs.resolve():
         return
     new, old = _beside(to)
@@ -490,27 +505,39 @@ def export(results: Results, to: Path) -> None:
     new.mkdir(parents=True)
     for row, samples in results.all_samples().items():
         for sample in {sample.run: sample for sample in samples}.values():
-            _copy_run(results, sample, new / row / sample.run.path.name, row, first=sample.run == samples[0].run)
+            name = f"{row}/{sample.run.path.name}"
+            had = (to / name / sample.run.policy_path.name).is_file()
+            _copy_run(results, sample, new / name, row, had or sample.run == samples[0].run)
     if (results.study.runs / STUDY_FILE).is_file():
         shutil.copyfile(results.study.runs / STUDY_FILE, new / STUDY_FILE)
     (new / WRITTEN).write_text("footwork report wrote this folder, and the next one replaces it.\n", encoding="utf-8")
+    lost = sorted(p.relative_to(to) for p in to.rglob("*") if p.is_file() and not (new / p.relative_to(to)).is_file())
+    if lost:
+        shutil.rmtree(new, ignore_errors=True)
+        raise RunError(
+            f"{to} would lose {len(lost)} of its files, {lost[0]} among them, which {results.study.runs} has damaged, "
+            f"unreadable or not at all: put them back from there, or choose another --to"
+        )
     if to.exists():
         to.rename(old)
     new.rename(to)
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _copy_run(results: Results, sample: Sample, place: Path, row: str, first: bool) -> None:
+def _copy_run(results: Results, sample: Sample, place: Path, row: str, with_policy: bool) -> None:
+    """Copy what of a run is whole; its policy where other rows stand on it, too."""
     run = sample.run
     place.mkdir(parents=True, exist_ok=True)
-    for name in ("config.json", "DONE", EVALUATION, TRANSITIONS):
-        if (run.path / name).is_file():
+    for name in ("config.json", "DONE"):
+        shutil.copyfile(run.path / name, place / name)
+    for name in files_of(sample.experiment):
+        if results.entry(sample, name) is not None:
             shutil.copyfile(run.path / name, place / name)
     curve = results.whole_curve(sample)
     if curve is not None:
         copy_curve(curve, run, sample.experiment, place / CURVE)
     stood_on = {results.study.row(other).needs for other in all_rows(results)}
-    if (first or row in stood_on) and run.policy_path.is_file():
+    if with_policy or row in stood_on:
         try:
             actors, meta = read_actors(run.policy_path)
         except CheckpointError as error:

@@ -58,6 +58,7 @@ class Results:
     study: Study
     any_length: bool = False
     problems: dict[str, None] = field(default_factory=dict)  # an ordered set
+    unfinished: set[str] = field(default_factory=set)  # those of them that are only runs that are not done yet
     _samples: dict[str, tuple[Sample, ...]] = field(default_factory=dict)
     _curves: dict[Path, Curve] = field(default_factory=dict)
     _files: dict[tuple[Path, str], list[dict[str, Any]]] = field(default_factory=dict)
@@ -72,6 +73,7 @@ class Results:
             found, left_out = find_samples(self.study, row, self.any_length)
             self._samples[row] = found
             self.problems.update(dict.fromkeys([*(run.why for run in left_out), *_mixed_versions(row, found)]))
+            self.unfinished.update(run.why for run in left_out if run.unfinished)
         return self._samples[row]
 
     def curves(self, row: str) -> list[tuple[Sample, Curve]]:
@@ -129,7 +131,10 @@ class Results:
         if key not in self._files:
             problem = problem_with(sample.run, name, self.study.size)
             if problem:
-                self.problems[f"{problem}: footwork reproduce --rows {sample.row} makes it again"] = None
+                remedy = f"footwork reproduce --rows {sample.row} makes it again"
+                if not sample.run.policy_path.is_file():  # a report keeps those of some seeds only
+                    remedy = f"delete {sample.run.path}, and footwork reproduce --rows {sample.row} trains it again"
+                self.problems[f"{problem}: {remedy}"] = None
             self._files[key] = [] if problem else json.loads((sample.run.path / name).read_bytes())["by_seed"]
         found = next((entry for entry in self._files[key] if entry["seed"] == sample.seed), None)
         if found is None and self._files[key]:
@@ -148,6 +153,12 @@ def find_samples(study: Study, row: str, any_length: bool = False) -> tuple[tupl
     experiment = study.row(row)
     found: dict[int, Sample] = {}
     left_out: list[LeftOut] = []
+    place = study.runs / row
+    left_out += [
+        LeftOut(f"{path} is a file where a folder of runs was to be")
+        for path in (place, *place.glob("seed*"))
+        if path.is_file()
+    ]
     configs = sorted((study.runs / row).glob("*/config.json"), key=lambda path: ("seeds-" in path.parent.name, path))
     for path in configs:
         run = RunDir(path.parent)
@@ -200,7 +211,13 @@ def _saved(run: RunDir) -> tuple[Experiment, list[int]]:
     """
     config = run.config()
     try:
-        return config_from_json(Experiment, config["experiment"]), [int(seed) for seed in config["seeds"]]
+        seeds = config["seeds"]
+        if not seeds or any(type(seed) is not int for seed in seeds):
+            raise ValueError(f"its seeds are {seeds!r}")
+        run.versions()
+        return config_from_json(Experiment, config["experiment"]), list(seeds)
+    except RunError:
+        raise
     except (KeyError, TypeError, ValueError) as error:
         version = run.versions().get("footwork", "unknown")
         raise RunError(f"{run.path} is of another version of footwork ({version}): {error}") from None
@@ -211,9 +228,15 @@ def _why_not(run: RunDir, saved: Experiment, row: Experiment, any_length: bool) 
         return LeftOut(f"{run.path} was trained with other fields than {row.name} has now: left out")
     if not run.finished:
         return LeftOut(f"{run.path} is not finished: left out", unfinished=True)
-    steps = run.summary().get("steps")
+    done, config = run.summary(), run.config()
+    steps = done.get("steps")
     if not isinstance(steps, int):
         return LeftOut(f"{run.path / 'DONE'} is damaged or of another version of footwork: it does not say steps")
+    if (done.get("row"), done.get("seeds")) != (saved.name, config["seeds"]):
+        other = f"{done.get('row')} seeds {done.get('seeds')}"
+        return LeftOut(
+            f"{run.path / 'DONE'} is of {other}, the run was begun as {saved.name} {config['seeds']}: left out"
+        )
     if abs(steps - planned_steps(row)) > SAME_LENGTH * planned_steps(row) and not any_length:
         return LeftOut(f"{run.path} is {steps:,} steps long, {row.name} takes {planned_steps(row):,}: left out")
     return None

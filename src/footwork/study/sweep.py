@@ -270,7 +270,7 @@ def _run_local(board: Board, workers: int, log: Callable[[str], None]) -> None:
                 show(board)
     except KeyboardInterrupt:
         _stop_all([worker.process for worker in at_work.values()])
-        raise SweepStopped(f"stopped: {board.line()}; call it again to go on") from None
+        raise _stopped(board) from None
     finally:
         _stop_all([worker.process for worker in at_work.values()])
 
@@ -347,6 +347,13 @@ def _stop_all(processes: Sequence[subprocess.Popen[bytes]]) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+def _stopped(board: Board) -> SweepStopped:
+    """What is said when all runs have been stopped."""
+    for job in list(board.active):
+        board.put_back(job)
+    return SweepStopped(f"stopped: {board.line()}; call it again to go on")
 
 
 @contextlib.contextmanager
@@ -432,7 +439,7 @@ def _run_on_ray(board: Board, workers: int, address: str, log: Callable[[str], N
     except KeyboardInterrupt:
         for reference in at_work:
             ray.cancel(reference, force=True)
-        raise SweepStopped(f"stopped: {board.line()}; call it again to go on") from None
+        raise _stopped(board) from None
 
 
 def _collect_tasks(ray: Any, board: Board, at_work: dict[Any, Job], log: Callable[[str], None]) -> None:

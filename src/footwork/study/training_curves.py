@@ -19,6 +19,7 @@ BINS = 100  # points of a training curve
 _FORMAT = 2
 _KEYS = {"return": "episode/return", "progress": "episode/progress"}  # means over a bin's episodes
 _VALUES = (*_KEYS, "success")
+_MOST = 1e9  # of a return: beyond it a file is damaged
 
 
 class Curve(NamedTuple):
@@ -39,14 +40,18 @@ def read_curve(run: RunDir, experiment: Experiment) -> Curve:
     kept = run.path / CURVE
     size = run.metrics_path.stat().st_size if run.metrics_path.is_file() else None
     whose = _whose(run, experiment)
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+    learners = experiment.runs_per_seed * len(run.config()["seeds"])
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         content = json.loads(kept.read_bytes())
         same = content["format"] == _FORMAT and content["of"] == whose
         if same and size in (None, content["metrics_bytes"]):
-            return _curve_from_json(content)
+            return _curve_from_json(content, learners)
     if size is None:
         what = "damaged, or of another run or version of footwork" if kept.is_file() else "missing"
-        raise RunError(f"{kept} is {what}, and {run.metrics_path} is not there to make it from")
+        raise RunError(
+            f"{kept} is {what}, and {run.metrics_path} is not there to make it from: delete {run.path}, and footwork "
+            f"reproduce --rows {experiment.name} trains it again"
+        )
     lines = read_metrics(run.metrics_path)
     end = run.summary()["steps"]
     if not lines or lines[-1]["step"] != end:
@@ -56,7 +61,9 @@ def read_curve(run: RunDir, experiment: Experiment) -> Curve:
         curve = _bin(lines, steps_per_iteration(experiment), len(run.config()["seeds"]))
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{run.metrics_path} is of another version of footwork: {error!r}") from None
-    curve = _curve_from_json(_curve_to_json(curve, whose, size))  # rounded now as it will be when it is read again
+    curve = _curve_from_json(
+        _curve_to_json(curve, whose, size), learners
+    )  # rounded now as it will be when it is read again
     with contextlib.suppress(CheckpointError):  # a folder that cannot be written is read again the next time
         write_curve(kept, curve, whose, size)
     return curve
@@ -123,8 +130,8 @@ def _curve_to_json(curve: Curve, whose: dict[str, Any], metrics_bytes: int | Non
     }
 
 
-def _curve_from_json(content: dict[str, Any]) -> Curve:
-    """The curve in a file.
+def _curve_from_json(content: dict[str, Any], learners: int) -> Curve:
+    """The curve in a file, of so many learners.
 
     Raises:
         ValueError, KeyError, TypeError: it is none.
@@ -133,8 +140,13 @@ def _curve_from_json(content: dict[str, Any]) -> Curve:
     arrays = {name: np.array(content["values"][name], np.float64) for name in _VALUES}  # None becomes NaN
     if step.ndim != 1 or not step.size or seconds.shape != step.shape or episodes.shape[:1] != step.shape:
         raise ValueError("steps, seconds and episodes of different numbers of bins")
-    if episodes.ndim != 2 or any(value.shape != episodes.shape for value in arrays.values()):
+    if episodes.shape[1:] != (learners,) or any(value.shape != episodes.shape for value in arrays.values()):
         raise ValueError("values of different numbers of bins or learners")
+    counts = (step, seconds, episodes)
+    if not all(np.isfinite(count).all() and (count >= 0).all() for count in counts) or (np.diff(step) <= 0).any():
+        raise ValueError("steps, seconds or episodes that are none")
+    if any((np.abs(value) > _MOST).any() for value in arrays.values()):  # NaN is where no episode ended
+        raise ValueError("a value beyond all bounds")
     return Curve(step, seconds, episodes, arrays)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from footwork.checkpoint import write_atomically
 from footwork.study.results import Results, seeds_in_words
 
 DPI = 160
@@ -112,8 +114,10 @@ def save(figure: Any, path: Path, note: str = "") -> list[Path]:
         figure.text(1.0, 1.015, note, ha="right", va="bottom", fontsize=8, color="#B00020", weight="bold")
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
-    figure.savefig(png, dpi=DPI, bbox_inches="tight", metadata={"Software": None})
-    figure.savefig(svg, bbox_inches="tight", metadata={"Date": None})
+    for file, style in ((png, {"dpi": DPI, "metadata": {"Software": None}}), (svg, {"metadata": {"Date": None}})):
+        content = io.BytesIO()
+        figure.savefig(content, format=file.suffix[1:], bbox_inches="tight", **style)
+        write_atomically(file, content.getvalue())
     plt.close(figure)
     return [png, svg]
 

@@ -309,6 +309,18 @@ def test_a_damaged_matrix_of_hand_overs_is_named(study):
         assert any("transitions.json is damaged" in problem for problem in found.problems)
 
 
+def test_half_a_curve_is_none(study):
+    path = fake_run(study, "walker/plain", 0)
+    training_curves.read_curve(RunDir(path), find_row("walker/plain"))
+    content = json.loads((path / training_curves.CURVE).read_text())
+    half = {name: content[name][:50] for name in ("step", "seconds", "episodes")}
+    values = {name: value[:50] for name, value in content["values"].items()}
+    write(path / training_curves.CURVE, {**content, **half, "values": values})
+    (path / "metrics.jsonl").unlink()
+    with pytest.raises(RunError, match=r"curve\.json is damaged"):
+        training_curves.read_curve(RunDir(path), find_row("walker/plain"))
+
+
 @pytest.mark.parametrize("values", [[], {}, {"return": [[1.0]], "progress": [[1.0]], "success": [[1.0]]}, None])
 def test_a_damaged_curve_is_made_again_where_the_metrics_are_and_named_where_they_are_not(study, values):
     path = fake_run(study, "walker/plain", 0)

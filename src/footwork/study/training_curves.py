@@ -45,7 +45,9 @@ def read_curve(run: RunDir, experiment: Experiment) -> Curve:
         content = json.loads(kept.read_bytes())
         same = content["format"] == _FORMAT and content["of"] == whose
         if same and size in (None, content["metrics_bytes"]):
-            return _curve_from_json(content, learners)
+            curve = _curve_from_json(content, learners)
+            if curve.step[-1] == whose["steps"]:
+                return curve
     if size is None:
         what = "damaged, or of another run or version of footwork" if kept.is_file() else "missing"
         raise RunError(

@@ -285,7 +285,7 @@ def test_places_that_are_no_runs_are_told_apart_from_unknown_rows(tmp_path):
 
 
 def test_unknown_and_untrained_rows_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"unknown row 'walker/fast'; known rows: walker/{plain, ") as caught:
+    with pytest.raises(ValueError, match=r"unknown row 'walker/fast'; known rows: walker/{plain,") as caught:
         find_trained("walker/fast", tmp_path)
     assert all(part in str(caught.value) for row in EXPERIMENTS for part in row.rsplit("/", 1))
     assert "\n" not in str(caught.value)

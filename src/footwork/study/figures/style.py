@@ -83,7 +83,11 @@ def log_axis(ax: Any, words: Callable[[float], str], decades: float) -> None:
     if not np.isfinite(first) or high <= 0:
         return
     low = max(first, high / 10**decades)
-    ticks = [m * 10.0**e for e in range(-4, 9) for m in (1, 3) if low <= m * 10.0**e <= 1.001 * high]
+    ticks: list[float] = []
+    for steps in ((1, 3), (1, 1.5, 2, 3, 5, 7)):  # a short axis gets finer ones
+        ticks = [m * 10.0**e for e in range(-4, 9) for m in steps if low <= m * 10.0**e <= 1.001 * high]
+        if len(ticks) > 1:
+            break
     ax.set_xticks(ticks, [words(tick) for tick in ticks])
     ax.set_xlim(low, 1.05 * high)
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Statistic = Callable[[Floats], Floats]  # of scores [draws, S, T], over the last two axes: [draws]
 
-DRAWS = 20_000  # resamples of an interval that decides something: its ends are steady to a hundredth of its width
+DRAWS = 20_000  # resamples of an interval that decides something; 2000 leave its ends 1.3 % of its width of noise
 BAND_DRAWS = 2000  # of a figure's band, at every point
 CONFIDENCE = 0.95
 

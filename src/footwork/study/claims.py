@@ -305,9 +305,13 @@ CLAIMS: tuple[Claim, ...] = (
                 "greater",
                 0.05,
                 decides=not how,
-                paired="seed by seed" in how,
+                paired=paired,
             )
-            for metric, how in (("way", ""), ("way", ", seed by seed"), ("success", ", success"))
+            for metric, how, paired in (
+                ("way", "", False),
+                ("way", ", seed by seed", True),
+                ("success", ", success", False),
+            )
         ),
         everywhere=True,
     ),

@@ -22,7 +22,7 @@ from footwork.evaluate import Episodes, play_episodes, transitions
 from footwork.record import RunDir, RunError, versions
 from footwork.study.experiments import find_row, is_row
 from footwork.study.plan import Size
-from footwork.study.runs import NEEDED, load_policies, load_run, one_seed
+from footwork.study.runs import NEEDED, how_to_train_again, load_policies, load_run, one_seed
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment, Trained, choices_of
 
@@ -140,7 +140,8 @@ def measure(run: RunDir, size: Size, num_threads: int = 1) -> None:
     if not run.finished:
         raise RunError(f"{run.path} is not finished: only finished runs are measured")
     if not run.policy_path.is_file():
-        raise RunError(f"{run.path} has no policy to be measured with: delete that folder, and it is trained again")
+        row = str(run.summary().get("row"))
+        raise RunError(f"{run.path} has no policy to be measured with: {how_to_train_again(run, row)}")
     trained = load_run(run)
     makers = {EVALUATION: _evaluation, TRANSITIONS: _transitions}
     for name in files_of(trained.experiment):

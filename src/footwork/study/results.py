@@ -21,6 +21,7 @@ from footwork.study.experiments import is_row
 from footwork.study.measure import EVALUATION, problem_with
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
+from footwork.study.runs import how_to_train_again
 from footwork.study.training_curves import Curve, of_seed, read_curve
 from footwork.train import Experiment, planned_steps
 
@@ -133,7 +134,7 @@ class Results:
             if problem:
                 remedy = f"footwork reproduce --rows {sample.row} makes it again"
                 if not sample.run.policy_path.is_file():  # a report keeps those of some seeds only
-                    remedy = f"delete {sample.run.path}, and footwork reproduce --rows {sample.row} trains it again"
+                    remedy = how_to_train_again(sample.run, sample.row)
                 self.problems[f"{problem}: {remedy}"] = None
             self._files[key] = [] if problem else json.loads((sample.run.path / name).read_bytes())["by_seed"]
         found = next((entry for entry in self._files[key] if entry["seed"] == sample.seed), None)

@@ -34,6 +34,11 @@ PACKAGED = "packaged weights"
 MAX_SEED = 2**31 - 1
 
 
+def how_to_train_again(run: RunDir, row: str) -> str:
+    """What to do about a run of the study that cannot be mended from its own files."""
+    return f"delete {run.path}, and footwork reproduce --rows {row} trains it again"
+
+
 def run_path(runs: Path, row: str, seeds: tuple[int, ...]) -> Path:
     """Where the run of a row with these seeds lies."""
     name = "seed-" if len(seeds) == 1 else "seeds-"

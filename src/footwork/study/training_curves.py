@@ -12,6 +12,7 @@ import numpy as np
 from footwork.checkpoint import CheckpointError, write_atomically
 from footwork.record import RunDir, RunError, read_metrics
 from footwork.statistics import Floats
+from footwork.study.runs import how_to_train_again
 from footwork.train import Experiment, steps_per_iteration
 
 CURVE = "curve.json"
@@ -48,17 +49,16 @@ def read_curve(run: RunDir, experiment: Experiment) -> Curve:
             curve = _curve_from_json(content, learners)
             if curve.step[-1] == whose["steps"]:
                 return curve
+    remedy = how_to_train_again(run, experiment.name)
     if size is None:
         what = "damaged, or of another run or version of footwork" if kept.is_file() else "missing"
-        raise RunError(
-            f"{kept} is {what}, and {run.metrics_path} is not there to make it from: delete {run.path}, and footwork "
-            f"reproduce --rows {experiment.name} trains it again"
-        )
+        raise RunError(f"{kept} is {what}, and {run.metrics_path} is not there to make it from: {remedy}")
     lines = read_metrics(run.metrics_path)
     end = run.summary()["steps"]
     if not lines or lines[-1]["step"] != end:
         last = lines[-1]["step"] if lines else "none"
-        raise RunError(f"{run.metrics_path} is truncated: the run has {end} steps, its last line is of step {last}")
+        said = f"{run.metrics_path} is truncated: the run has {end} steps, its last line is of step {last}"
+        raise RunError(f"{said}: {remedy}")
     try:
         curve = _bin(lines, steps_per_iteration(experiment), len(run.config()["seeds"]))
     except (KeyError, TypeError, ValueError) as error:

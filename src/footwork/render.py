@@ -92,6 +92,7 @@ class View:
         camera: follows the ant, or shows ``extent`` at an angle (arena) or from above.
         extent: centre x, y and half sizes (m) of what there is to see.
         most_pieces: of a path.
+        still: a single picture rather than one of many: finer shadows, for 1.4 times the time without a GPU.
     """
 
     width: int
@@ -99,6 +100,7 @@ class View:
     camera: CameraName
     extent: tuple[float, float, float, float]
     most_pieces: int = 0
+    still: bool = False
 
 
 def painter(task: Task, view: View, platform: str | None) -> Painter:
@@ -213,14 +215,16 @@ def furnished(task: Task, view: View) -> mujoco.MjSpec:
     """The model of the task's arena, with light for a picture."""
     spec = build_spec(task.robot, task.arena)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = view.width, view.height
-    spec.visual.quality.offsamples, spec.visual.quality.shadowsize = 4, 2048
+    spec.visual.quality.offsamples, spec.visual.quality.shadowsize = 4, 4096 if view.still else 2048
     spec.visual.headlight.ambient = [0.38, 0.38, 0.40]
     spec.visual.headlight.diffuse = [0.18, 0.18, 0.18]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     x, y, half_x, half_y = view.extent
     # MuJoCo's shadows of a directional light are sound well within this distance only
     spec.stat.center, spec.stat.extent = [x, y, 0.0], max(30.0, 4 * half_x, 4 * half_y)
-    spec.visual.map.znear, spec.visual.map.zfar, spec.visual.map.shadowclip = 0.03, 8.0, 1.0
+    spec.visual.map.znear, spec.visual.map.zfar = 0.03, 8.0
+    # within 1.0 surfaces far from the middle shadow themselves in specks; within 2.0 a map of 2048 px is too coarse
+    spec.visual.map.shadowclip = 2.0 if view.still else 1.0
     for light in spec.lights:
         light.pos, light.dir = [x, y, 20.0], [-0.25, 0.3, -0.92]
         light.diffuse, light.ambient, light.specular = [0.55, 0.54, 0.52], [0.0] * 3, [0.12] * 3

@@ -123,7 +123,7 @@ class _Photograph:
 
     def __init__(self, task: Task, extent: tuple[float, float, float, float], size: tuple[int, int], platform: str):
         goal = None if task.goal_radius is None else np.array(task.arena.goals[0])
-        self._view = View(*size, "arena", extent)
+        self._view = View(*size, "arena", extent, still=True)
         painter = GLPainter(task, self._view, platform)
         shot = Shot(standing(task.arena.start), rgb(_LIMB), goal, (), np.array(task.arena.start))
         picture = painter.paint(shot)

@@ -16,7 +16,7 @@ from footwork.doors.cli import run
 from footwork.evaluate import Episodes
 from footwork.record import RunDir, RunError, read_metrics
 from footwork.statistics import Effect, iqm
-from footwork.study import answers, claims, measure, plan, report, results, training_curves
+from footwork.study import answers, claims, judging, measure, plan, report, report_files, results, training_curves
 from footwork.study.experiments import EXPERIMENTS, GRIDS, MAIN, find_row, match_rows
 from footwork.study.figures import FIGURES, draw_figures, find_figures, style
 from footwork.study.metrics import METRICS
@@ -439,13 +439,13 @@ def test_results_that_a_killed_report_had_put_aside_come_back(study, tmp_path, m
 def test_runs_on_another_engine_are_found_whatever_they_are_and_keep_what_others_stand_on(study, tmp_path, monkeypatch):
     fill(study, ("bullet/maze/flat/free",), 2)
     found = results.Results(study)
-    assert claims.prefixes_at_hand(found) == ("", "bullet/")
-    assert "bullet/maze/flat/free" in report.all_rows(found)
+    assert results.prefixes_at_hand(found) == ("", "bullet/")
+    assert "bullet/maze/flat/free" in results.all_rows(found)
     fill(study, ("bullet/walker/plain",), 2)
     (study.runs / "bullet/walker/plain/seed-1/policy.safetensors").write_bytes(b"torn")
     found = results.Results(study)
     found.samples("bullet/walker/plain")
-    report.export(found, tmp_path / "out/results")
+    report_files.export(found, tmp_path / "out/results")
     assert any("the report's results lack it" in problem for problem in found.problems)  # the second seed's is wanted
 
 
@@ -503,7 +503,7 @@ def test_truncated_metrics_are_named(study):
     ],
 )
 def test_the_rules(rule, bound, effect, verdict):
-    assert claims.decide(rule, bound, Effect(*effect)) == verdict
+    assert judging.decide(rule, bound, Effect(*effect)) == verdict
 
 
 def test_claims_read_rows_that_exist_with_metrics_that_exist():
@@ -521,7 +521,7 @@ def test_claims_read_rows_that_exist_with_metrics_that_exist():
 
 def verdicts(study, number):
     found = results.Results(study)
-    return {j.where: j for j in claims.judge_all(found) if j.claim.number == number}
+    return {j.where: j for j in judging.judge_all(found) if j.claim.number == number}
 
 
 def test_verdicts_need_ten_seeds_and_say_so(study):
@@ -591,7 +591,7 @@ def test_masters_on_the_same_sub_policies_are_compared_seed_by_seed(study):
     assert plain.verdict == "holds"
     exactly(fake_run(study, "bandit/paper/plain", 10), 0.1)  # has no counterpart, and is left out by name
     held = results.Results(study)
-    found = next(j for j in claims.judge_all(held) if j.claim.number == 13 and j.setting.schedule == "paper").findings
+    found = next(j for j in judging.judge_all(held) if j.claim.number == 13 and j.setting.schedule == "paper").findings
     again = next(f for f in found if f.contrast.words == "bandit, plain" and f.contrast.metric == "way")
     assert (again.effect, again.seeds) == (plain.effect, (10, 10))
     assert any("claim 13 compares bandit/paper/plain seed by seed" in problem for problem in held.problems)
@@ -633,7 +633,7 @@ def test_a_claim_about_variance_compares_spreads(study):
     assert all(finding.probability > 0.7 for finding in found.findings if finding.contrast.decides)
     few = results.Results(Study(study.runs))
     spreads = claims.CLAIMS[5].contrasts[0]
-    assert claims._probability(spreads, [np.zeros((2, 4)), np.zeros((10, 4))]) is None
+    assert judging._probability(spreads, [np.zeros((2, 4)), np.zeros((10, 4))]) is None
     assert few.scores("walker/plain", "fluctuation").shape == (10, 4)
 
 
@@ -716,8 +716,8 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
     figures = {path.name: path.read_bytes() for path in (tmp_path / "report/figures").iterdir()}
     for one in draw_figures(results.Results(kept), find_figures(["7", "12"]), tmp_path / "again"):
         assert all(path.read_bytes() == figures[path.name] for path in one.files)
-    again = claims.judge_all(results.Results(kept))
-    for one, other in zip(claims.judge_all(found), again, strict=True):
+    again = judging.judge_all(results.Results(kept))
+    for one, other in zip(judging.judge_all(found), again, strict=True):
         assert (one.verdict, one.why) == (other.verdict, other.why)
         for a, b in zip(one.findings, other.findings, strict=True):
             assert a.effect is b.effect is None or a.effect == pytest.approx(b.effect, rel=1e-3)
@@ -771,7 +771,7 @@ def test_an_answer_shows_its_rows_and_names_those_that_have_no_runs(study):
     fill(study, ("walker/plain",), 3)
     found = results.Results(study)
     sentence = next(answer for answer in answers.ANSWERS if answer.section == "3.4")
-    speed, handover = answers.said(sentence, claims.judge_all(found), found).splitlines()[1:]
+    speed, handover = answers.said(sentence, judging.judge_all(found), found).splitlines()[1:]
     mean = METRICS["speed"].show(float(iqm(found.scores("walker/plain", "speed"))))
     assert f"walker/plain {mean} (3 seeds); no runs of light/walker/plain bullet/walker/plain" in speed
     assert handover.startswith(METRICS["handover"].words)
@@ -779,11 +779,11 @@ def test_an_answer_shows_its_rows_and_names_those_that_have_no_runs(study):
 
 def test_one_seed_has_no_interval(study):
     fill(study, ("walker/plain", "walker/random-start"), 1)
-    (judgement,) = (j for j in claims.judge_all(results.Results(study)) if j.claim.number == 12)
-    assert re.fullmatch(r"[\d.]+ %", claims.show_effect(judgement.findings[0]))
+    (judgement,) = (j for j in judging.judge_all(results.Results(study)) if j.claim.number == 12)
+    assert re.fullmatch(r"[\d.]+ %", judging.show_effect(judgement.findings[0]))
     assert judgement.why.startswith("1 seed, 10 are asked for")
-    (variance,) = (j for j in claims.judge_all(results.Results(study)) if j.claim.number == 6)
-    assert claims.show_effect(variance.findings[0]) == "-"
+    (variance,) = (j for j in judging.judge_all(results.Results(study)) if j.claim.number == 6)
+    assert judging.show_effect(variance.findings[0]) == "-"
 
 
 @pytest.mark.parametrize(

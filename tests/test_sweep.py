@@ -18,7 +18,7 @@ from footwork.record import RunError
 from footwork.study import job, sweep
 from footwork.study.measure import measured
 from footwork.study.plan import FULL, Job, Study, plan
-from footwork.study.report import export
+from footwork.study.report_files import export
 from footwork.study.results import Results
 from footwork.study.runs import run_path
 

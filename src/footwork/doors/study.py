@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 
 from footwork.doors import tables
 from footwork.record import RunError
-from footwork.study.claims import judge_all, rows_read
+from footwork.study.claims import rows_read
 from footwork.study.experiments import is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
+from footwork.study.judging import judge_all
 from footwork.study.plan import FULL, QUICK, Study, default_rows, mark, plan, read_mark
-from footwork.study.report import all_rows, check_place, write_report
-from footwork.study.results import Results, strays
+from footwork.study.report import write_report
+from footwork.study.report_files import check_place
+from footwork.study.results import Results, all_rows, strays
 from footwork.study.sweep import run_study
 
 if TYPE_CHECKING:

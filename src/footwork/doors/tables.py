@@ -10,8 +10,8 @@ from rich.table import Table
 
 from footwork.arena import DIRECTIONS
 from footwork.physics import DEFAULT_ENGINE, ENGINES
-from footwork.study.claims import Judgement
 from footwork.study.experiments import group_of
+from footwork.study.judging import Judgement
 from footwork.study.plan import Job
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment

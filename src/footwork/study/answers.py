@@ -11,8 +11,9 @@ from typing import Any
 
 from footwork.learn.config import PAPER
 from footwork.statistics import iqm
-from footwork.study.claims import PAPER_REGULARISERS, Judgement, show_effect
+from footwork.study.claims import PAPER_REGULARISERS
 from footwork.study.experiments import GRIDS, in_braces, is_row
+from footwork.study.judging import Judgement, show_effect
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
 from footwork.study.results import Results, seeds_in_words

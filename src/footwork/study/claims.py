@@ -24,26 +24,11 @@ reward and schedule, the paper's or ours. A verdict names all of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
-
-from footwork.statistics import (
-    Effect,
-    Floats,
-    Statistic,
-    as_scores,
-    contrast,
-    generator_for,
-    overall_iqm,
-    probability_of_improvement,
-    spread,
-)
-from footwork.study.experiments import MAIN, SCHEDULES, find_row, in_braces, is_row
-from footwork.study.metrics import METRICS
-from footwork.study.results import Results, seeds_in_words
+from footwork.study.experiments import MAIN, SCHEDULES, is_row
 
 Rule = Literal["greater", "not worse", "same", "at least", "at most"]
 Verdict = Literal["holds", "does not hold", "undecided"]
@@ -109,33 +94,6 @@ class Setting:
     def fill(self, row: str) -> str:
         """The row's address in this setting."""
         return self.prefix + row.format(schedule=self.schedule, guided="" if self.schedule == "paper" else "guided-")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What a comparison found."""
-
-    contrast: Contrast
-    rows: tuple[str, ...]
-    seeds: tuple[int, ...]  # of each row
-    effect: Effect | None  # None where a row has no runs
-    probability: float | None  # of improvement, of two rows
-    verdict: Verdict
-    so_far: Verdict  # what the rule says if the number of seeds is not asked for
-    room: float | None = None  # the most that a difference of shares could be: what the other row leaves
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """A claim's verdict in a setting."""
-
-    claim: Claim
-    setting: Setting
-    where: str  # engine, ant, the masters' reward and schedule
-    findings: tuple[Finding, ...]
-    verdict: Verdict
-    so_far: Verdict  # if the number of seeds is not asked for
-    why: str
 
 
 def _greater(words: str, one: str, other: str, metric: str, margin: float, decides: bool = True) -> Contrast:
@@ -455,192 +413,15 @@ def rows_read(prefixes: Iterable[str] = ("",)) -> list[str]:
     return sorted(mine, key=lambda name: (order.get(name, len(order)), name))
 
 
-def prefixes_at_hand(results: Results) -> tuple[str, ...]:
-    """The default engine and ant, and those others that have finished runs in the study's folder."""
-    runs = results.study.runs
-    places = sorted(path.name for path in runs.iterdir() if path.is_dir()) if runs.is_dir() else []
-    there = [f"{name}/" for name in places if any(is_row(f"{name}/{row}") for row in MAIN)]
-    return ("", *(prefix for prefix in there if any((runs / prefix).rglob("DONE"))))
-
-
-def judge_all(results: Results) -> list[Judgement]:
-    """Every claim in every setting at hand, in the order of the claims."""
-    prefixes = prefixes_at_hand(results)
-    return [judge(results, claim, setting) for claim in CLAIMS for setting in settings_of(claim, prefixes)]
-
-
-def judge(results: Results, claim: Claim, setting: Setting) -> Judgement:
-    """A claim's verdict in a setting, from the files of its runs."""
-    contrasts = [c for c in claim.contrasts if c.decides or all(is_row(setting.fill(row)) for row in c.rows)]
-    findings = tuple(_find(results, claim, c, setting) for c in contrasts)
-    deciding = [finding for finding in findings if finding.contrast.decides]
-    verdict, so_far = _overall([f.verdict for f in deciding]), _overall([f.so_far for f in deciding])
-    return Judgement(claim, setting, _where(claim, setting), findings, verdict, so_far, _why(claim, deciding, verdict))
-
-
-def _overall(verdicts: list[Verdict]) -> Verdict:
-    if "does not hold" in verdicts:
-        return "does not hold"
-    return "holds" if set(verdicts) == {"holds"} else "undecided"
-
-
-def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> Finding:
-    rows = tuple(setting.fill(row) for row in what.rows)
-    by_seed = [results.scores_by_seed(row, what.metric) if is_row(row) else {} for row in rows]
-    stands_on = [_stands_on(row) if what.paired and is_row(row) else row for row in rows]
-    by_seed = _in_pairs(results, claim, rows, stands_on, by_seed)
-    scores = [np.array(list(score.values()), np.float64) for score in by_seed]
-    seeds = tuple(len(score) for score in scores)
-    if not all(seeds):
-        return Finding(what, rows, seeds, None, None, "undecided", "undecided")
-    statistic: Statistic = spread if what.statistic == "spread" else overall_iqm
-    generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
-    units = [[(row, seed) for seed in score] for row, score in zip(stands_on, by_seed, strict=True)]
-    effect = contrast(scores, what.weights, generator, statistic, units=units)
-    so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"
-    verdict = so_far if min(seeds) >= claim.min_seeds else "undecided"
-    room = None
-    if METRICS[what.metric].is_share and what.rule == "greater" and what.weights == (1, -1):
-        room = 1.0 - float(overall_iqm(as_scores(scores[1])))
-    return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far, room)
-
-
-def _stands_on(row: str) -> str:
-    """The row whose runs a row's seeds stand on: a master's sub-policies, anything else's own."""
-    return find_row(row).sub_policies or row
-
-
-def _in_pairs(
-    results: Results, claim: Claim, rows: Sequence[str], stands_on: Sequence[str], by_seed: Sequence[dict[int, Any]]
-) -> list[dict[int, Any]]:
-    """Of rows that stand on the same runs and have different seeds, those that all of them have; the others are named.
-
-    Where one has none at all there is nothing to compare, and nothing to say.
-    """
-    paired = []
-    for row, base, scores in zip(rows, stands_on, by_seed, strict=True):
-        partners = [other for other, b in zip(by_seed, stands_on, strict=True) if b == base and other]
-        alone = sorted(seed for seed in scores if not all(seed in other for other in partners))
-        if alone:
-            seeds = ", ".join(map(str, alone))
-            said = (
-                f"claim {claim.number} compares {row} seed by seed, and leaves out those without a counterpart: {seeds}"
-            )
-            results.problems[said] = None
-        paired.append({seed: score for seed, score in scores.items() if seed not in alone})
-    return paired
-
-
-def _probability(what: Contrast, scores: list[Floats]) -> float | None:
-    if len(scores) != 2:
-        return None
-    if what.statistic == "spread":  # that a run is farther from the middle of its row
-        if min(map(len, scores)) < 3:  # a lone one is its own middle
-            return None
-        scores = [np.abs(score - np.median(score, axis=0)) for score in scores]
-    return probability_of_improvement(*scores)
-
-
-def decide(rule: Rule, bound: float, effect: Effect) -> Verdict:
-    """What a rule says of an effect (see the table at the top)."""
-    estimate, low, high = effect
-    verdicts: dict[Rule, tuple[bool, bool]] = {
-        "greater": (low > 0 and estimate >= bound, high < bound),
-        "not worse": (low > -bound, high < 0 and estimate <= -bound),
-        "same": (-bound < low and high < bound, not low <= 0 <= high and abs(estimate) >= bound),
-        "at least": (low >= bound, high < bound),
-        "at most": (high <= bound, low > bound),
-    }
-    holds, fails = verdicts[rule]
-    return "holds" if holds else "does not hold" if fails else "undecided"
-
-
-def _where(claim: Claim, setting: Setting) -> str:
-    experiment = find_row(f"{setting.prefix}walker/plain")
-    where = f"{experiment.engine}, {experiment.task.robot.name} ant"
-    return f"{where}, {SCHEDULES[setting.schedule]}" if len(settings_of(claim)) > 1 else where
-
-
-def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
-    """One phrase that says what the verdict rests on, or what is missing."""
-    missing = in_braces(dict.fromkeys(row for f in deciding for row, n in zip(f.rows, f.seeds, strict=True) if n == 0))
-    if verdict != "undecided":
-        decisive = [f for f in deciding if f.verdict == verdict]
-        said = [f"{seeds_in_words(min(min(f.seeds) for f in decisive))} or more on every side"]
-        turned = [f.contrast.words for f in decisive if is_reversed(f)]
-        said += [f"the other way round: {', '.join(turned)}"] if turned else []
-        said += [f"no runs of {missing}"] if missing else []
-        return "; ".join([*said, *_no_room(deciding)])
-    if missing:
-        return f"no runs of {missing}"
-    fewest = min(min(f.seeds) for f in deciding)
-    if fewest < claim.min_seeds:
-        so_far = _overall([f.so_far for f in deciding])
-        return f"{seeds_in_words(fewest)}, {claim.min_seeds} are asked for; so far: {so_far}"
-    return "; ".join(["the interval allows both", *_no_room(deciding)])
-
-
-def _no_room(deciding: list[Finding]) -> list[str]:
-    """Comparisons in which the other row leaves less than the smallest difference that matters."""
-    return [
-        f"{f.contrast.words}, no more than {100 * f.room:.1f} points were possible"
-        for f in deciding
-        if f.room is not None and f.room < f.contrast.bound
-    ]
-
-
-def _in_brackets(finding: Finding, effect: Effect) -> str:
-    low, high = (METRICS[finding.contrast.metric].number(value) for value in (effect.low, effect.high))
-    return f"[{low}, {high}]"
-
-
-def is_reversed(finding: Finding) -> bool:
-    """Whether a difference that was to be positive is negative, and not only too small."""
-    return finding.contrast.rule in ("greater", "not worse") and finding.effect is not None and finding.effect.high < 0
-
-
-def show_effect(finding: Finding) -> str:
-    """The effect with its interval and unit; one seed has no interval, and no spread."""
-    if finding.effect is None:
-        return "-"
-    metric, alone = METRICS[finding.contrast.metric], min(finding.seeds) == 1
-    if alone and finding.contrast.statistic == "spread":
-        return "-"
-    interval = "" if alone else f" {_in_brackets(finding, finding.effect)}"
-    unit = metric.unit if len(finding.rows) == 1 else metric.difference
-    return f"{metric.number(finding.effect.estimate)}{interval} {unit}"
-
-
-def show_bound(what: Contrast) -> str:
-    """The rule, and the smallest difference that matters or the threshold."""
-    metric = METRICS[what.metric]
-    return f"{what.rule}, {metric.number(what.bound)} {metric.unit if len(what.rows) == 1 else metric.difference}"
-
-
-def show_chance(finding: Finding) -> str:
-    """The probability of improvement; of spreads, that a run is farther from the middle of its row."""
-    if finding.probability is None:
-        return "-"
-    farther = " farther from the middle" if finding.contrast.statistic == "spread" else ""
-    return f"{finding.probability:.2f}{farther}"
-
-
 __all__ = [
     "CLAIMS",
     "MIN_SEEDS",
+    "PAPER_REGULARISERS",
     "Claim",
     "Contrast",
-    "Finding",
-    "Judgement",
+    "Rule",
     "Setting",
-    "decide",
-    "is_reversed",
-    "judge",
-    "judge_all",
-    "prefixes_at_hand",
+    "Verdict",
     "rows_read",
     "settings_of",
-    "show_bound",
-    "show_chance",
-    "show_effect",
 ]

@@ -7,96 +7,29 @@ make the report again, and to go on with the study.
 
 from __future__ import annotations
 
-import base64
-import html
 import os
 import platform
-import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 import footwork
-from footwork import checkpoint
-from footwork.checkpoint import CheckpointError, write_atomically
+from footwork.checkpoint import write_atomically
 from footwork.evaluate import HANDOVER_AFTER, HANDOVER_SPEED, HANDOVER_STEPS, IDLE_SPEED, SWITCHING_STEPS
-from footwork.record import RunError, source_digest
+from footwork.record import source_digest
 from footwork.statistics import iqm
 from footwork.study.answers import ANSWERS, choices, said
-from footwork.study.claims import (
-    CLAIMS,
-    Claim,
-    Finding,
-    Judgement,
-    judge_all,
-    prefixes_at_hand,
-    rows_read,
-    show_bound,
-    show_chance,
-    show_effect,
-)
-from footwork.study.experiments import EXPERIMENTS, SCHEDULES, find_row, in_braces, is_row
+from footwork.study.claims import CLAIMS, Claim, rows_read
+from footwork.study.experiments import SCHEDULES, find_row, in_braces
 from footwork.study.figures import FIGURES, Drawn, count_in_words, draw_figures
-from footwork.study.measure import files_of
+from footwork.study.judging import Finding, Judgement, judge_all, show_bound, show_chance, show_effect
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
-from footwork.study.plan import STUDY_FILE, Study, default_rows, plan, read_mark, read_origin
-from footwork.study.results import Results, Sample, seeds_in_words
-from footwork.study.runs import read_actors
-from footwork.study.training_curves import CURVE, copy_curve
+from footwork.study.pages import Block, Bullets, Code, Heading, Picture, TableBlock, Text, markdown, page
+from footwork.study.plan import default_rows, plan, read_origin
+from footwork.study.report_files import RESULTS, check_place, export
+from footwork.study.results import Results, Sample, all_rows, prefixes_at_hand, seeds_in_words
 from footwork.train import planned_steps, steps_per_iteration
-
-RESULTS = "results"  # folder of a report, with the small files of its runs
-WRITTEN = "WRITTEN_BY_FOOTWORK_REPORT"  # in that folder: the next report may replace it
-
-
-@dataclass(frozen=True)
-class Heading:
-    """A heading; the level as in HTML."""
-
-    text: str
-    level: int = 2
-
-
-@dataclass(frozen=True)
-class Text:
-    """A paragraph."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Bullets:
-    """A list."""
-
-    lines: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Code:
-    """Commands."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class TableBlock:
-    """A table; lines in cells are separated by newlines."""
-
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure with its caption, in which names in braces stand for facts."""
-
-    drawn: Drawn
-    facts: Mapping[str, str]
-
-
-Block = Heading | Text | Bullets | Code | TableBlock | Picture
 
 
 def write_report(results: Results, to: Path, command: str) -> list[Path]:
@@ -108,7 +41,7 @@ def write_report(results: Results, to: Path, command: str) -> list[Path]:
         command: the line that made this report.
 
     Raises:
-        RunError: see :func:`check_place`.
+        RunError: see :func:`footwork.study.report_files.check_place`.
         OSError: it cannot be written.
         CheckpointError: it cannot be written.
     """
@@ -119,7 +52,7 @@ def write_report(results: Results, to: Path, command: str) -> list[Path]:
     export(results, to / RESULTS)  # first: it may refuse, and may find what is wrong with a file, which the pages say
     drawn = [one for prefix in prefixes for one in draw_figures(results, FIGURES, to / "figures", prefix)]
     blocks = report_blocks(results, drawn, command)
-    pages = {"REPORT.md": _markdown(blocks, to), "report.html": _page(blocks, _title(results))}
+    pages = {"REPORT.md": markdown(blocks, to), "report.html": page(blocks, _title(results))}
     for name, text in pages.items():
         write_atomically(to / name, text.encode())
     return [to / name for name in pages]
@@ -240,13 +173,6 @@ def _standing(j: Judgement) -> str:
         return j.verdict.capitalize()
     fewest = min(min(f.seeds) for f in j.findings if f.contrast.decides)
     return _STANDINGS[4] if fewest == 0 else _STANDINGS[3] if fewest < j.claim.min_seeds else _STANDINGS[2]
-
-
-def all_rows(results: Results) -> list[str]:
-    """The table, and the same under every engine or ant at hand."""
-    elsewhere = [prefix + row for prefix in prefixes_at_hand(results) if prefix for row in EXPERIMENTS]
-    known = [row for row in elsewhere if row not in EXPERIMENTS and is_row(row)]
-    return [*EXPERIMENTS, *known]
 
 
 def _overview_table(judgements: Sequence[Judgement]) -> TableBlock:
@@ -437,218 +363,4 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     ]
 
 
-def check_place(study: Study, to: Path) -> None:
-    """Refuse a folder for the report in which writing it would cost something that the study's runs do not hold.
-
-    What a report that was killed in the middle had put aside is brought back first.
-
-    Raises:
-        RunError: ``to`` is the folder of runs, or ``to``/results holds the runs, something that no report wrote,
-            another study, or runs that these lack.
-        CheckpointError: nothing can be written there.
-    """
-    place, runs = to / RESULTS, study.runs
-    if runs.resolve() == to.resolve():
-        raise RunError(f"{to} is the folder of the runs: choose another --to for the report")
-    checkpoint.check_writable(to / "REPORT.md")
-    aside = _beside(place)[1]
-    if aside.exists() and not place.exists():
-        aside.rename(place)
-    if runs.resolve() == place.resolve():  # a report made again from its own files leaves them as they are
-        return
-    if runs.resolve().is_relative_to(place.resolve()):
-        raise RunError(f"{place} would be replaced, and the runs in {runs} are in it: choose another --to")
-    if not place.exists() or (place.is_dir() and not any(place.iterdir())):
-        return
-    if not (place / WRITTEN).is_file():
-        raise RunError(f"{place} holds something that no report wrote (it has no {WRITTEN}): choose another --to")
-    if read_mark(place) != study.size:
-        raise RunError(
-            f"{place} is of the {read_mark(place).name} study, not of the {study.size.name} one: choose another --to"
-        )
-    there = sorted(path.parent.relative_to(place) for path in place.rglob("DONE"))
-    lost = [path for path in there if not (runs / path / "DONE").is_file()]
-    if lost:
-        many = f"{len(lost)} finished runs" if len(lost) > 1 else "a finished run"
-        copy = f"mkdir -p {runs} && cp -rn {place}/. {runs}"
-        raise RunError(
-            f"{place} would be replaced, and it holds {many} that {runs} lacks ({lost[0]}): to go on with that study "
-            f"copy what is missing ({copy}), else choose another --to"
-        )
-
-
-def _beside(place: Path) -> tuple[Path, Path]:
-    """Where results are built, and where the ones before are put while they change places."""
-    return place.with_name(f".{place.name}.new"), place.with_name(f".{place.name}.old")
-
-
-def export(results: Results, to: Path) -> None:
-    """Copy the small files of every run that was read: enough to draw and to judge again.
-
-    And policies, without their critics: of every seed where other rows stand on them, so that ``footwork reproduce``
-    goes on from a copy of this folder as it would from the runs themselves; else of the first seed, so that each row
-    can be watched and evaluated from here. A master finds its sub-policies beside it, under the same seed.
-
-    What an earlier report wrote there stays until everything has been copied.
-
-    Raises:
-        RunError: see :func:`check_place`.
-        OSError: they cannot be written.
-        CheckpointError: they cannot be written.
-    """
-    check_place(results.study, to.parent)
-    if to.resolve() == results.study.runs.resolve():
-        return
-    new, old = _beside(to)
-    for left in (new, old):
-        shutil.rmtree(left, ignore_errors=True)
-    new.mkdir(parents=True)
-    for row, samples in results.all_samples().items():
-        for sample in {sample.run: sample for sample in samples}.values():
-            name = f"{row}/{sample.run.path.name}"
-            had = (to / name / sample.run.policy_path.name).is_file()
-            _copy_run(results, sample, new / name, row, had or sample.run == samples[0].run)
-    if (results.study.runs / STUDY_FILE).is_file():
-        shutil.copyfile(results.study.runs / STUDY_FILE, new / STUDY_FILE)
-    (new / WRITTEN).write_text("footwork report wrote this folder, and the next one replaces it.\n", encoding="utf-8")
-    lost = sorted(p.relative_to(to) for p in to.rglob("*") if p.is_file() and not (new / p.relative_to(to)).is_file())
-    if lost:
-        shutil.rmtree(new, ignore_errors=True)
-        raise RunError(
-            f"{to} would lose {len(lost)} of its files, {lost[0]} among them, which {results.study.runs} has damaged, "
-            f"unreadable or not at all: put them back from there, or choose another --to"
-        )
-    if to.exists():
-        to.rename(old)
-    new.rename(to)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _copy_run(results: Results, sample: Sample, place: Path, row: str, with_policy: bool) -> None:
-    """Copy what of a run is whole; its policy where other rows stand on it, too."""
-    run = sample.run
-    place.mkdir(parents=True, exist_ok=True)
-    for name in ("config.json", "DONE"):
-        shutil.copyfile(run.path / name, place / name)
-    for name in files_of(sample.experiment):
-        if results.entry(sample, name) is not None:
-            shutil.copyfile(run.path / name, place / name)
-    curve = results.whole_curve(sample)
-    if curve is not None:
-        copy_curve(curve, run, sample.experiment, place / CURVE)
-    stood_on = {results.study.row(other).needs for other in all_rows(results)}
-    if with_policy or row in stood_on:
-        try:
-            actors, meta = read_actors(run.policy_path)
-        except CheckpointError as error:
-            results.problems[f"{error}: the report's results lack it"] = None
-        else:
-            checkpoint.save(place / run.policy_path.name, actors, meta)
-
-
-# Markdown and HTML ----------------------------------------------------------------------------------------------------
-
-
-def _markdown(blocks: Sequence[Block], to: Path) -> str:
-    return "\n\n".join(_as_markdown(block, to) for block in blocks) + "\n"
-
-
-def _as_markdown(block: Block, to: Path) -> str:
-    match block:
-        case Heading(text, level):
-            return f"{'#' * level} {text}"
-        case Text(text):
-            return text
-        case Bullets(lines):
-            return "\n".join(f"* {line}" for line in lines)
-        case Code(text):
-            return f"```\n{text}\n```"
-        case TableBlock(header, rows):
-            every = [header, ("---",) * len(header), *rows]
-            return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in every)
-        case Picture(drawn, facts):
-            png, svg = (os.path.relpath(path, to) for path in drawn.files)
-            return f"### {_heading(drawn)}\n\n![{drawn.figure.title}]({png})\n\n{_caption(drawn, facts)} [SVG]({svg})"
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", "<br>")
-
-
-def _heading(drawn: Drawn) -> str:
-    figure = drawn.figure
-    number = figure.name.partition("-")[0].lstrip("0")
-    paper = f" (the paper's {figure.paper})" if figure.paper else ""
-    where = f", {drawn.prefix.strip('/')}" if drawn.prefix else ""
-    return f"{number}. {figure.title}{where}{paper}"
-
-
-def _caption(drawn: Drawn, facts: Mapping[str, str]) -> str:
-    without = f" Without finished runs: {in_braces(drawn.without)}." if drawn.without else ""
-    under = f" --under {drawn.prefix.strip('/')}" if drawn.prefix else ""
-    return f"{drawn.figure.caption.format(**facts)}{without} Drawn by `footwork figures {drawn.figure.name}{under}`."
-
-
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c1c1c; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
-table { border-collapse: collapse; font-size: 13px; margin: 1rem 0; display: block; overflow-x: auto; }
-th, td { border-bottom: 1px solid #ddd; padding: .3rem .6rem; text-align: left; vertical-align: top;
-  white-space: pre-line; }
-th { border-bottom: 2px solid #999; }
-.holds { color: #00664b; font-weight: 600; } .does-not-hold { color: #a33b00; font-weight: 600; }
-.undecided { color: #555; font-weight: 600; }
-figure { margin: 2rem 0; } img { max-width: 100%; height: auto; } figcaption { font-size: 14px; color: #444; }
-pre { background: #f5f4f0; padding: .8rem; overflow-x: auto; }
-"""
-
-
-def _page(blocks: Sequence[Block], title: str) -> str:
-    body = "\n".join(_as_html(block) for block in blocks)
-    head = (
-        f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
-    )
-    return (
-        f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head><body>\n{body}\n</body></html>\n'
-    )
-
-
-def _as_html(block: Block) -> str:
-    match block:
-        case Heading(text, level):
-            return f"<h{level}>{html.escape(text)}</h{level}>"
-        case Text(text):
-            return f"<p>{_inline(text)}</p>"
-        case Bullets(lines):
-            return "<ul>" + "\n".join(f"<li>{_inline(line)}</li>" for line in lines) + "</ul>"
-        case Code(text):
-            return f"<pre>{html.escape(text)}</pre>"
-        case TableBlock(header, rows):
-            every = ["".join(f"<th>{html.escape(cell)}</th>" for cell in header)]
-            every += ["".join(f"<td>{_inline(cell)}</td>" for cell in row) for row in rows]
-            return "<table>" + "\n".join(f"<tr>{line}</tr>" for line in every) + "</table>"
-        case Picture(drawn, facts):
-            data = base64.b64encode(drawn.files[0].read_bytes()).decode()
-            image = f'<img src="data:image/png;base64,{data}" alt="{html.escape(drawn.figure.title)}">'
-            caption = f"<figcaption>{_inline(_caption(drawn, facts))}</figcaption>"
-            return f"<figure><h3>{html.escape(_heading(drawn))}</h3>{image}{caption}</figure>"
-
-
-def _inline(text: str) -> str:
-    """Escaped text in which **bold** and `code` mean what they do in Markdown."""
-    parts: list[str] = []
-    for number, part in enumerate(html.escape(text).split("`")):
-        bold = part.split("**")
-        parts.append(
-            f"<code>{part}</code>" if number % 2 else "".join(_bold(p) if i % 2 else p for i, p in enumerate(bold))
-        )
-    return "".join(parts)
-
-
-def _bold(text: str) -> str:
-    """Bold; verdicts in their colours."""
-    verdict = text.lower()
-    mark = f' class="{verdict.replace(" ", "-")}"' if verdict in ("holds", "does not hold", "undecided") else ""
-    return f"<b{mark}>{text}</b>"
-
-
-__all__ = ["all_rows", "check_place", "export", "report_blocks", "write_report"]
+__all__ = ["report_blocks", "write_report"]

@@ -17,7 +17,7 @@ import numpy as np
 
 from footwork.record import RunDir, RunError, config_from_json
 from footwork.statistics import Floats
-from footwork.study.experiments import is_row
+from footwork.study.experiments import EXPERIMENTS, MAIN, is_row
 from footwork.study.measure import EVALUATION, problem_with
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
@@ -248,4 +248,19 @@ def seeds_in_words(count: int | str) -> str:
     return f"{count} seed{'' if str(count) == '1' else 's'}"
 
 
-__all__ = ["LeftOut", "Results", "Sample", "find_samples", "seeds_in_words", "strays"]
+def prefixes_at_hand(results: Results) -> tuple[str, ...]:
+    """The default engine and ant, and those others that have finished runs in the study's folder."""
+    runs = results.study.runs
+    places = sorted(path.name for path in runs.iterdir() if path.is_dir()) if runs.is_dir() else []
+    there = [f"{name}/" for name in places if any(is_row(f"{name}/{row}") for row in MAIN)]
+    return ("", *(prefix for prefix in there if any((runs / prefix).rglob("DONE"))))
+
+
+def all_rows(results: Results) -> list[str]:
+    """The table, and the same under every engine or ant at hand."""
+    elsewhere = [prefix + row for prefix in prefixes_at_hand(results) if prefix for row in EXPERIMENTS]
+    known = [row for row in elsewhere if row not in EXPERIMENTS and is_row(row)]
+    return [*EXPERIMENTS, *known]
+
+
+__all__ = ["LeftOut", "Results", "Sample", "all_rows", "find_samples", "prefixes_at_hand", "seeds_in_words", "strays"]

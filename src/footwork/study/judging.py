@@ -83,7 +83,9 @@ def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> F
     if not all(seeds):
         return Finding(what, rows, seeds, None, None, "undecided", "undecided")
     statistic: Statistic = spread if what.statistic == "spread" else overall_iqm
-    generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
+    # one row's interval is the same wherever the report gives it
+    of = f"row {rows[0]} {what.metric}" if len(rows) == 1 else f"claim {claim.number} {what.words} {what.metric} {rows}"
+    generator = generator_for(of)
     units = [[(row, seed) for seed in score] for row, score in zip(stands_on, by_seed, strict=True)]
     effect = contrast(scores, what.weights, generator, statistic, units=units)
     so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"

@@ -18,7 +18,7 @@ import footwork
 from footwork.checkpoint import write_atomically
 from footwork.evaluate import HANDOVER_AFTER, HANDOVER_SPEED, HANDOVER_STEPS, IDLE_SPEED, SWITCHING_STEPS
 from footwork.record import source_digest
-from footwork.statistics import iqm
+from footwork.statistics import contrast, generator_for
 from footwork.study.answers import ANSWERS, choices, said
 from footwork.study.claims import CLAIMS, Claim, rows_read
 from footwork.study.experiments import SCHEDULES, find_row, in_braces
@@ -113,10 +113,11 @@ def _reading() -> tuple[str, ...]:
 
 def _rows_read(results: Results) -> str:
     return (
-        "Interquartile means over seeds. Control steps: of one run, all its directions counted. Minutes: of training, "
-        f"mean over runs, one core each, without the measuring that follows ({results.study.size.episodes} episodes, "
-        "drawn from the policy and not its mean, or the hand-over matrix and random switching). Way: along the "
-        "straight line. One row with what it stands on: `footwork reproduce --rows ROW`."
+        "Interquartile means over seeds with 95 % intervals. Control steps: of one run, all its directions counted. "
+        "Minutes: of training, mean over runs, one core each, without the measuring that follows "
+        f"({results.study.size.episodes} episodes, drawn from the policy and not its mean, or the hand-over matrix and "
+        "random switching). Way: along the straight line. One row with what it stands on: "
+        "`footwork reproduce --rows ROW`."
     )
 
 
@@ -294,9 +295,13 @@ def _steps(sample: Sample) -> int:
 
 
 def _middle(results: Results, row: str, metric: str) -> str:
-    scores = results.scores(row, metric)
-    unit = " %" if METRICS[metric].is_share else ""
-    return METRICS[metric].number(float(iqm(scores))) + unit if len(scores) else "-"
+    """A row's interquartile mean in a metric, with its interval; one seed has none."""
+    scores, kind = results.scores(row, metric), METRICS[metric]
+    if len(scores) == 0:
+        return "-"
+    effect = contrast([scores], (1,), generator_for(f"row {row} {metric}"))
+    interval = "" if len(scores) == 1 else f" [{kind.number(effect.low)}, {kind.number(effect.high)}]"
+    return f"{kind.number(effect.estimate)}{' %' if kind.is_share else ''}{interval}"
 
 
 def _choices_table(results: Results) -> TableBlock:

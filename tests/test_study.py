@@ -713,7 +713,7 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
     assert '<b class="undecided">undecided</b>' in page
     (eleven,) = (j.findings[0] for j in judging.judge_all(found) if j.claim.number == 11)
     estimate, low, high = re.findall(r"[\d.]+", judging.show_effect(eleven))
-    assert f"| {estimate} % [{low}, {high}] |" in text  # the row's line says the same of the same runs
+    assert f"| {estimate} [{low}, {high}] % |" in text  # the row's line says the same of the same runs
     kept = Study(tmp_path / "report/results")
     assert not list(kept.runs.rglob("metrics.jsonl"))
     figures = {path.name: path.read_bytes() for path in (tmp_path / "report/figures").iterdir()}

@@ -92,7 +92,8 @@ class View:
         camera: follows the ant, or shows ``extent`` at an angle (arena) or from above.
         extent: centre x, y and half sizes (m) of what there is to see.
         most_pieces: of a path.
-        still: a single picture rather than one of many: finer shadows, for 1.4 times the time without a GPU.
+        still: one picture, not one of many: shadows without specks far from the middle, for 1.4 times the time without
+            a GPU.
     """
 
     width: int
@@ -223,7 +224,7 @@ def furnished(task: Task, view: View) -> mujoco.MjSpec:
     # MuJoCo's shadows of a directional light are sound well within this distance only
     spec.stat.center, spec.stat.extent = [x, y, 0.0], max(30.0, 4 * half_x, 4 * half_y)
     spec.visual.map.znear, spec.visual.map.zfar = 0.03, 8.0
-    # within 1.0 surfaces far from the middle shadow themselves in specks; within 2.0 a map of 2048 px is too coarse
+    # in extents: at 1.0 surfaces far from the middle shadow themselves in specks; 2.0 asks for twice the pixels
     spec.visual.map.shadowclip = 2.0 if view.still else 1.0
     for light in spec.lights:
         light.pos, light.dir = [x, y, 20.0], [-0.25, 0.3, -0.92]

@@ -83,11 +83,11 @@ def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> F
     if not all(seeds):
         return Finding(what, rows, seeds, None, None, "undecided", "undecided")
     statistic: Statistic = spread if what.statistic == "spread" else overall_iqm
-    # one row's interval is the same wherever the report gives it
-    of = f"row {rows[0]} {what.metric}" if len(rows) == 1 else f"claim {claim.number} {what.words} {what.metric} {rows}"
-    generator = generator_for(of)
-    units = [[(row, seed) for seed in score] for row, score in zip(stands_on, by_seed, strict=True)]
-    effect = contrast(scores, what.weights, generator, statistic, units=units)
+    effect = results.middle(rows[0], what.metric) if len(rows) == 1 and what.statistic == "iqm" else None
+    if effect is None:
+        generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
+        units = [[(row, seed) for seed in score] for row, score in zip(stands_on, by_seed, strict=True)]
+        effect = contrast(scores, what.weights, generator, statistic, units=units)
     so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"
     verdict = so_far if min(seeds) >= claim.min_seeds else "undecided"
     room = None
@@ -180,11 +180,6 @@ def _no_room(deciding: list[Finding]) -> list[str]:
     ]
 
 
-def _in_brackets(finding: Finding, effect: Effect) -> str:
-    low, high = (METRICS[finding.contrast.metric].number(value) for value in (effect.low, effect.high))
-    return f"[{low}, {high}]"
-
-
 def is_reversed(finding: Finding) -> bool:
     """Whether a difference that was to be positive is negative, and not only too small."""
     return finding.contrast.rule in ("greater", "not worse") and finding.effect is not None and finding.effect.high < 0
@@ -197,9 +192,8 @@ def show_effect(finding: Finding) -> str:
     metric, alone = METRICS[finding.contrast.metric], min(finding.seeds) == 1
     if alone and finding.contrast.statistic == "spread":
         return "-"
-    interval = "" if alone else f" {_in_brackets(finding, finding.effect)}"
     unit = metric.unit if len(finding.rows) == 1 else metric.difference
-    return f"{metric.number(finding.effect.estimate)}{interval} {unit}"
+    return f"{metric.with_interval(finding.effect, alone)} {unit}"
 
 
 def show_bound(what: Contrast) -> str:
@@ -221,7 +215,6 @@ __all__ = [
     "Judgement",
     "decide",
     "is_reversed",
-    "judge",
     "judge_all",
     "show_bound",
     "show_chance",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from footwork.arena import DIRECTIONS, Arena, DistanceField, Point, geodesic_field
-from footwork.statistics import Floats
+from footwork.statistics import Effect, Floats
 from footwork.study.measure import EVALUATION, TRANSITIONS, straight_line_stop
 from footwork.study.training_curves import mean_between
 
@@ -50,6 +50,11 @@ class Metric:
     def number(self, value: float) -> str:
         """The value as text, without."""
         return f"{100 * value:.1f}" if self.is_share else f"{value:.4g}"
+
+    def with_interval(self, effect: Effect, alone: bool = False) -> str:
+        """The estimate with its interval, without a unit; a lone seed has no interval."""
+        interval = "" if alone else f" [{self.number(effect.low)}, {self.number(effect.high)}]"
+        return self.number(effect.estimate) + interval
 
     @property
     def difference(self) -> str:

@@ -18,7 +18,6 @@ import footwork
 from footwork.checkpoint import write_atomically
 from footwork.evaluate import HANDOVER_AFTER, HANDOVER_SPEED, HANDOVER_STEPS, IDLE_SPEED, SWITCHING_STEPS
 from footwork.record import source_digest
-from footwork.statistics import contrast, generator_for
 from footwork.study.answers import ANSWERS, choices, said
 from footwork.study.claims import CLAIMS, Claim, rows_read
 from footwork.study.experiments import SCHEDULES, find_row, in_braces
@@ -263,7 +262,7 @@ def _rows_table(results: Results, rows: Sequence[str]) -> TableBlock:
     lines = []
     for row in rows:
         shown = {"handover", "speed", "return"} if find_row(row).is_walker else {"way", "route", "success"}
-        cells = [_middle(results, row, name) if name in shown else "" for name in metrics]
+        cells = [_shown(results, row, name) if name in shown else "" for name in metrics]
         minutes = [curve.seconds[-1] / 60 for sample in _one_per_run(results, row) if (curve := results.curve(sample))]
         steps = sorted({_steps(sample) for sample in results.samples(row)})
         taken = " to ".join(f"{n:,}" for n in dict.fromkeys((steps[0], steps[-1])))
@@ -294,14 +293,11 @@ def _steps(sample: Sample) -> int:
     return int(sample.run.summary()["steps"]) * sample.experiment.runs_per_seed
 
 
-def _middle(results: Results, row: str, metric: str) -> str:
-    """A row's interquartile mean in a metric, with its interval; one seed has none."""
-    scores, kind = results.scores(row, metric), METRICS[metric]
-    if len(scores) == 0:
+def _shown(results: Results, row: str, metric: str) -> str:
+    effect, kind = results.middle(row, metric), METRICS[metric]
+    if effect is None:
         return "-"
-    effect = contrast([scores], (1,), generator_for(f"row {row} {metric}"))
-    interval = "" if len(scores) == 1 else f" [{kind.number(effect.low)}, {kind.number(effect.high)}]"
-    return f"{kind.number(effect.estimate)}{' %' if kind.is_share else ''}{interval}"
+    return kind.with_interval(effect, alone=len(results.samples(row)) == 1) + (" %" if kind.is_share else "")
 
 
 def _choices_table(results: Results) -> TableBlock:

@@ -127,4 +127,4 @@ def _copy_run(results: Results, sample: Sample, place: Path, row: str, with_poli
             checkpoint.save(place / run.policy_path.name, actors, meta)
 
 
-__all__ = ["RESULTS", "WRITTEN", "check_place", "export"]
+__all__ = ["RESULTS", "check_place", "export"]

@@ -1,4 +1,4 @@
-"""Read a study back from its files: which runs count, their training curves, their measurements.
+"""Read a study back from its files: which rows are at hand, which runs count, their curves and measurements.
 
 A run counts as a row if its saved config is the row's, and its length too. Whatever is
 left out (unfinished, another config or length, a damaged or missing file, a seed that
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from footwork.record import RunDir, RunError, config_from_json
-from footwork.statistics import Floats
+from footwork.statistics import Effect, Floats, contrast, generator_for
 from footwork.study.experiments import EXPERIMENTS, MAIN, is_row
 from footwork.study.measure import EVALUATION, problem_with
 from footwork.study.metrics import METRICS
@@ -99,6 +99,17 @@ class Results:
             ValueError: there is no such row or metric.
         """
         return np.array(list(self.scores_by_seed(row, metric).values()), np.float64)
+
+    def middle(self, row: str, metric: str) -> Effect | None:
+        """A row's interquartile mean over seeds in a metric, with its interval: the same wherever it is shown.
+
+        None if it has no runs; the interval of one seed is empty.
+
+        Raises:
+            ValueError: there is no such row or metric.
+        """
+        scores = self.scores(row, metric)
+        return contrast([scores], (1,), generator_for(f"row {row} {metric}")) if len(scores) else None
 
     def scores_by_seed(self, row: str, metric: str) -> dict[int, Any]:
         """A metric of each of a row's seeds that has it.
@@ -257,7 +268,7 @@ def prefixes_at_hand(results: Results) -> tuple[str, ...]:
 
 
 def all_rows(results: Results) -> list[str]:
-    """The table, and the same under every engine or ant at hand."""
+    """Every row of the table of experiments, and those under each other engine or ant at hand."""
     elsewhere = [prefix + row for prefix in prefixes_at_hand(results) if prefix for row in EXPERIMENTS]
     known = [row for row in elsewhere if row not in EXPERIMENTS and is_row(row)]
     return [*EXPERIMENTS, *known]

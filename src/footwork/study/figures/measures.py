@@ -68,7 +68,8 @@ def switching(results: Results, rows: tuple[str, ...]) -> Any:
         for (row, entries), shift in zip(there.items(), apart, strict=False):
             periods = sorted({int(k) for entry in entries for k in entry["switching"]})
             values = [[e["switching"][str(k)][name] for e in entries if str(k) in e["switching"]] for k in periods]
-            effects = [_effect(v, f"switching {row} {name} {k}") for k, v in zip(periods, values, strict=True)]
+            generators = [generator_for(f"switching {row} {name} {k}") for k in periods]
+            effects = [contrast([v], (1,), generator) for v, generator in zip(values, generators, strict=True)]
             interval_marks(ax, np.multiply(periods, shift), effects, look_of(row), label_of(row))
         ax.set_title(words)
         ax.set_xlabel(f"control steps between switches\n{seeds_of(results, there)}")
@@ -82,15 +83,11 @@ def switching(results: Results, rows: tuple[str, ...]) -> Any:
     return figure
 
 
-def _effect(values: Any, name: str) -> Effect:
-    return contrast([values], (1,), generator_for(name))
-
-
 def _points(results: Results, grid: Grid, metric: str) -> tuple[list[Any], list[Effect]]:
     """Values of a grid's field that have runs, and the metric there."""
-    found = [(value, results.scores(row, metric)) for value, row in grid.points().items()]
-    found = [(value, scores) for value, scores in found if len(scores)]
-    return [v for v, _ in found], [_effect(s, f"grid {grid.name} {metric} {v}") for v, s in found]
+    found = [(value, results.middle(row, metric)) for value, row in grid.points().items()]
+    there = [(value, effect) for value, effect in found if effect is not None]
+    return [value for value, _ in there], [effect for _, effect in there]
 
 
 def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, ...], height: float) -> Any:
@@ -193,10 +190,9 @@ def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) 
     """A metric of several rows, one line each; names, and numbers of seeds, stand left of the first panel."""
     names = []
     for y, row in enumerate(rows):
-        scores = results.scores(row, metric)
-        names.append(f"{row.removeprefix('ablation/')} ({len(scores)})")
-        if len(scores):
-            e = _effect(scores, f"dots {row} {metric}")
+        names.append(f"{row.removeprefix('ablation/')} ({len(results.scores(row, metric))})")
+        e = results.middle(row, metric)
+        if e is not None:
             ax.plot([e.low, e.high], [y, y], color="#0072B2", lw=2, solid_capstyle="butt")
             ax.plot(e.estimate, y, "o", color="#0072B2", ms=4)
         elif metric != "route" or "bandit/" not in row:  # a way around walls needs walls

@@ -133,8 +133,6 @@ def maze_paths(results: Results, rows: tuple[str, ...]) -> Any:
     figure, axes = plt.subplots(lines, columns, figsize=(7.2, 2.6 * lines), squeeze=False)
     for ax, row in zip(axes.flat, rows, strict=False):
         entry = next(iter(results.measurements(row, EVALUATION)), None)
-        if entry is None:
-            ax.set_xticks([])
         for path in [] if entry is None else entry["paths"]:
             points = np.array(path["xy"])
             _draw_path(ax, points, path["choices"][: len(points) - 1])

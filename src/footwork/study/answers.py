@@ -210,9 +210,11 @@ ANSWERS: tuple[Answer, ...] = (
     Answer(
         "8",
         "This is a fair comparison: the observations are enough for an ideal algorithm",
-        figures=(5, 6),
+        figures=(5, 6, 19),
+        shows=_grid("way", "ablation/bandit/flat-free-bonus", "ablation/bandit/flat-penalised-bonus"),
         built="flat policies see what masters see and take 10 M control steps; a master takes 0.5 or 2 M on "
-        "sub-policies of 4 to 8 M. With the masters' reward (flat/guided-...) they are shown too",
+        "sub-policies of 4 to 8 M. With the masters' reward (flat/guided-...) they are shown too, and without the "
+        "entropy bonus, which is ours",
     ),
     Answer(
         "8, 9",

@@ -135,11 +135,17 @@ _SHORT = {"success": "success", "route": "way around the walls"}
 
 def _beats_flat(place: str) -> tuple[Contrast, ...]:
     master = f"{place}/{{schedule}}/appropriate-bias"
+    kinds = ("penalised", "free")
     return _shown_too(
-        (
-            _way("against flat, penalised", master, f"{place}/flat/{{guided}}penalised"),
-            _way("against flat, free", master, f"{place}/flat/{{guided}}free"),
+        tuple(_way(f"against flat, {kind}", master, f"{place}/flat/{{guided}}{kind}") for kind in kinds)
+    ) + tuple(
+        _way(
+            f"against flat, {kind}, without an entropy bonus",
+            master,
+            f"ablation/{place}/flat-{{guided}}{kind}-bonus/0.0",
+            decides=False,
         )
+        for kind in kinds
     )
 
 

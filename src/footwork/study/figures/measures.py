@@ -142,11 +142,10 @@ def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
     """B as a number or as a size, the potential, the heavy and the light ant: rows side by side, in three metrics."""
-    fields = [g for g in GRIDS if g.field in ("ppo.minibatch_size", "task.potential") and "walker" not in g.base]
-    masters = [row for grid in fields for row in grid.points().values()]
-    walkers = [row for grid in GRIDS if grid.base == "walker/plain" for row in grid.points().values()]
+    tasks = [row for grid in _COMPARED if "walker" not in grid.base for row in grid.points().values()]
+    walkers = [row for grid in _COMPARED if "walker" in grid.base for row in grid.points().values()]
     lines = (
-        ("B and the potential: masters", masters, ("way", "route", "success")),
+        ("B, the potential and the entropy bonus: masters, flat policies", tasks, ("way", "route", "success")),
         (
             "B, annealing and the ant: sub-policies",
             [*walkers, *_ANNEALED, *(row for row in _OF_ANTS if "walker/" in row)],
@@ -163,6 +162,7 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
     return figure
 
 
+_COMPARED = tuple(grid for grid in GRIDS if grid.field in ("ppo.minibatch_size", "task.potential", "ppo.ent_coef"))
 _OF_ANTS = tuple(
     f"{ant}{row}"
     for row in ("walker/plain", "walker/interleaved", "maze/hrl/plain", "maze/hrl/interleaved")
@@ -173,12 +173,7 @@ _ANNEALED = tuple(row for one in ANNEALED for row in (one.name.replace("ablation
 COMPARED: tuple[str, ...] = tuple(
     dict.fromkeys(
         (
-            *(
-                row
-                for grid in GRIDS
-                if grid.field in ("ppo.minibatch_size", "task.potential")
-                for row in grid.points().values()
-            ),
+            *(row for grid in _COMPARED for row in grid.points().values()),
             *_ANNEALED,
             *_OF_ANTS,
         )

@@ -231,7 +231,7 @@ FIGURES: tuple[Figure, ...] = (
     ),
     Figure(
         "19-choices",
-        "What the paper leaves open: B, the potential, the ant; and annealing",
+        "What the paper leaves open: B, the potential, the ant, the entropy bonus; and annealing",
         "IQM over seeds with 95 % intervals; in brackets the number of seeds. There are walls to go around on AntMaze "
         "only.",
         measures.comparisons,

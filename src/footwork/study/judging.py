@@ -78,22 +78,38 @@ def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> F
     by_seed = [results.scores_by_seed(row, what.metric) if is_row(row) else {} for row in rows]
     stands_on = [_stands_on(row) if what.paired and is_row(row) else row for row in rows]
     by_seed = _in_pairs(results, claim, rows, stands_on, by_seed)
-    scores = [np.array(list(score.values()), np.float64) for score in by_seed]
-    seeds = tuple(len(score) for score in scores)
-    if not all(seeds):
-        return Finding(what, rows, seeds, None, None, "undecided", "undecided")
-    statistic: Statistic = spread if what.statistic == "spread" else overall_iqm
-    effect = results.middle(rows[0], what.metric) if len(rows) == 1 and what.statistic == "iqm" else None
+    scores = [_as_array(score) for score in by_seed]
+    seeds = tuple(map(len, scores))
+    effect = _effect(results, claim, what, rows, stands_on, by_seed) if all(seeds) else None
     if effect is None:
-        generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
-        units = [[(row, seed) for seed in score] for row, score in zip(stands_on, by_seed, strict=True)]
-        effect = contrast(scores, what.weights, generator, statistic, units=units)
+        return Finding(what, rows, seeds, None, None, "undecided", "undecided")
     so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"
     verdict = so_far if min(seeds) >= claim.min_seeds else "undecided"
     room = None
     if METRICS[what.metric].is_share and what.rule == "greater" and what.weights == (1, -1):
         room = 1.0 - float(overall_iqm(as_scores(scores[1])))
     return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far, room)
+
+
+def _effect(
+    results: Results,
+    claim: Claim,
+    what: Contrast,
+    rows: Sequence[str],
+    stands_on: Sequence[str],
+    by_seed: Sequence[dict[int, Any]],
+) -> Effect | None:
+    """A comparison's estimate and interval; one row's mean is the one that tables and figures show."""
+    if len(rows) == 1 and what.statistic == "iqm":
+        return results.middle(rows[0], what.metric)
+    statistic: Statistic = spread if what.statistic == "spread" else overall_iqm
+    generator = generator_for(f"claim {claim.number} {what.words} {what.metric} {rows}")
+    units = [[(row, seed) for seed in score] for row, score in zip(stands_on, by_seed, strict=True)]
+    return contrast([_as_array(score) for score in by_seed], what.weights, generator, statistic, units=units)
+
+
+def _as_array(score: dict[int, Any]) -> Floats:
+    return np.array(list(score.values()), np.float64)
 
 
 def _stands_on(row: str) -> str:

@@ -81,10 +81,15 @@ def _mean_return(between: tuple[float, float], results: Results, sample: Sample)
     return None if returns is None else float(returns.mean())
 
 
-def _evaluated(name: str, results: Results, sample: Sample) -> float | None:
+def _evaluated(name: str, results: Results, sample: Sample) -> Any:
     entry = results.entry(sample, EVALUATION)
-    value = None if entry is None else entry.get(name)
-    return value["1.0"] if isinstance(value, dict) else value
+    return None if entry is None else entry.get(name)
+
+
+def _success(radius: float, results: Results, sample: Sample) -> float | None:
+    """Share of the episodes in which the ant comes so near to the goal."""
+    by_radius = _evaluated("success", results, sample)
+    return None if by_radius is None else by_radius[str(radius)]
 
 
 def _speed(results: Results, sample: Sample) -> float | None:
@@ -157,7 +162,8 @@ def _transitions(results: Results, sample: Sample) -> float | None:
 
 METRICS: dict[str, Metric] = {
     "way": Metric("share of the straight-line way to the goal", partial(_evaluated, "way")),
-    "success": Metric("episodes that come within 1 m of the goal", partial(_evaluated, "success")),
+    "success": Metric("episodes that come within 1 m of the goal", partial(_success, 1.0)),
+    "success close": Metric("episodes that come within 0.5 m of the goal", partial(_success, 0.5)),
     "route": Metric("share of the shortest way around the walls", _route),
     "stuck": Metric("episodes that end where the straight line meets the wall", partial(_evaluated, "stuck")),
     "stuck close": Metric("episodes that end within 0.5 m of there", partial(_ended_within, 0.5, straight_line_stop)),

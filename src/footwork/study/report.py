@@ -258,11 +258,11 @@ def _answers_table(judgements: Sequence[Judgement], results: Results) -> TableBl
 
 
 def _rows_table(results: Results, rows: Sequence[str]) -> TableBlock:
-    metrics = ("way", "route", "success", "handover", "speed", "return")
+    of_walkers, of_tasks = ("handover", "speed", "return"), ("way", "route", "success", "success close")
     lines = []
     for row in rows:
-        shown = {"handover", "speed", "return"} if find_row(row).is_walker else {"way", "route", "success"}
-        cells = [_shown(results, row, name) if name in shown else "" for name in metrics]
+        mine = of_walkers if find_row(row).is_walker else of_tasks
+        cells = [_shown(results, row, name) if name in mine else "" for name in (*of_tasks, *of_walkers)]
         minutes = [curve.seconds[-1] / 60 for sample in _one_per_run(results, row) if (curve := results.curve(sample))]
         steps = sorted({_steps(sample) for sample in results.samples(row)})
         taken = " to ".join(f"{n:,}" for n in dict.fromkeys((steps[0], steps[-1])))
@@ -276,6 +276,7 @@ def _rows_table(results: Results, rows: Sequence[str]) -> TableBlock:
         "way",
         "around walls",
         "within 1 m",
+        "0.5 m",
         "hand-overs",
         "m/s",
         "training return",

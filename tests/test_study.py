@@ -17,7 +17,7 @@ from footwork.evaluate import Episodes
 from footwork.record import RunDir, RunError, read_metrics
 from footwork.statistics import Effect, iqm
 from footwork.study import answers, claims, judging, measure, plan, report, report_files, results, training_curves
-from footwork.study.experiments import EXPERIMENTS, GRIDS, MAIN, find_row, match_rows
+from footwork.study.experiments import EXPERIMENTS, GRIDS, GRIDS_BY_NAME, MAIN, find_row, is_row, match_rows
 from footwork.study.figures import FIGURES, draw_figures, find_figures, style
 from footwork.study.metrics import METRICS
 from footwork.study.plan import FULL, QUICK, Study
@@ -46,10 +46,12 @@ def test_grids_are_rows_that_differ_in_one_field():
             assert EXPERIMENTS[row.name] == row
             assert row != MAIN[grid.base]
         assert grid.base in grid.points().values()
-    points = next(grid for grid in GRIDS if grid.name == "ablation/maze/k").points()
+    points = GRIDS_BY_NAME["ablation/maze/k"].points()
     assert [*points] == [10, 20, 50, 100, 200, 400]
     assert find_row(points[100]).option_steps == 100
     assert find_row("ablation/random-start/t/25").regulariser.steps == 25
+    bonus = GRIDS_BY_NAME["ablation/bandit/flat-free-bonus"].points()
+    assert bonus == {0.0: "ablation/bandit/flat-free-bonus/0.0", 0.02: "bandit/flat/free"}
 
 
 def test_rows_of_another_ant_stand_on_rows_of_that_ant():
@@ -138,6 +140,15 @@ def test_arrivals_by_hand():
     assert found["stuck"] == 0.25
     assert found["success"]["1.0"] == 0.5
     assert found["time_to_goal_s"] == 15.0
+
+
+def test_success_is_counted_within_a_radius(study):
+    path = fake_run(study, "bandit/flat/free", 0) / "evaluation.json"
+    content = json.loads(path.read_text())
+    content["by_seed"][0]["success"] |= {"0.5": 0.25, "1.0": 0.5}
+    path.write_text(json.dumps(content))
+    held = results.Results(study)
+    assert [held.scores("bandit/flat/free", name).item() for name in ("success", "success close")] == [0.5, 0.25]
 
 
 # ---------------------------------------------------------------- results
@@ -566,6 +577,26 @@ def test_shown_comparisons_do_not_decide_and_rows_of_ablations_do_not_ask_for_te
     fill(study, ("light/walker/plain",), 2)
     light = verdicts(study, 14)["mujoco, light ant, our reward, our masters' schedule"]
     assert not any("annealed" in finding.contrast.words for finding in light.findings)
+
+
+def test_every_comparison_has_its_rows_in_some_setting():
+    for claim in claims.CLAIMS:
+        settings = claims.settings_of(claim, ("", "light/", "bullet/"))
+        for c in claim.contrasts:
+            assert any(all(is_row(setting.fill(row)) for row in c.rows) for setting in settings), c.words
+
+
+def test_flat_policies_without_a_bonus_are_shown_in_the_papers_setting_only(study):
+    fill(study, ("bandit/paper/appropriate-bias",), 2, quality=0.9)
+    fill(study, ("ablation/bandit/flat-free-bonus/0.0",), 2, quality=0.3)
+    found = {
+        setting: [f for f in judgement.findings if "without an entropy bonus" in f.contrast.words]
+        for setting, judgement in verdicts(study, 1).items()
+    }
+    paper, ours = found["mujoco, heavy ant, the paper's reward and schedule"], [*found.values()]
+    assert [f.rows[1] for f in paper] == [f"ablation/bandit/flat-{k}-bonus/0.0" for k in ("penalised", "free")]
+    assert paper[1].so_far == "holds"
+    assert [len(findings) for findings in ours] == [2, 0]
 
 
 def test_verdicts_name_engine_and_ant_and_one_failing_comparison_is_enough(study):

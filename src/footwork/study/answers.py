@@ -12,7 +12,7 @@ from typing import Any
 from footwork.learn.config import PAPER
 from footwork.statistics import iqm
 from footwork.study.claims import PAPER_REGULARISERS
-from footwork.study.experiments import GRIDS, in_braces, is_row
+from footwork.study.experiments import GRIDS_BY_NAME, in_braces, is_row
 from footwork.study.judging import Judgement, show_effect
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
@@ -26,7 +26,7 @@ class Shown:
     Args:
         metric: a key of METRICS.
         rows: label and address of each.
-        where: the grid that the labels are values of.
+        where: the grid that the labels are values of, and what they are.
     """
 
     metric: str
@@ -57,9 +57,13 @@ class Answer:
 
 def _grid(metric: str, *names: str) -> tuple[Shown, ...]:
     """The points of grids, labelled with their values."""
-    grids = [next(grid for grid in GRIDS if grid.name == name) for name in names]
+    grids = [GRIDS_BY_NAME[name] for name in names]
     return tuple(
-        Shown(metric, tuple(("as it is" if v is None else str(v), row) for v, row in grid.points().items()), grid.name)
+        Shown(
+            metric,
+            tuple(("as it is" if v is None else str(v), row) for v, row in grid.points().items()),
+            f"{grid.name}, {grid.words}",
+        )
         for grid in grids
     )
 

@@ -220,10 +220,11 @@ GRIDS: tuple[Grid, ...] = (
     Grid("ablation/maze/B-as-size", "maze/paper/interleaved", "ppo.minibatch_size", (32,), "B as a size"),
     Grid("ablation/maze/potential", "maze/hrl/interleaved", "task.potential", ("straight",), "potential"),
     Grid("ablation/maze/potential-paper", "maze/paper/interleaved", "task.potential", ("geodesic",), "potential"),
-    # The bonus is ours too, and only penalties hold a deviation back: do flat policies fail because of it?
+    # The bonus is ours too, and only penalties hold a deviation back: do flat policies fail because of the bonus?
     Grid("ablation/bandit/flat-free-bonus", "bandit/flat/free", "ppo.ent_coef", (0.0,), "entropy bonus"),
     Grid("ablation/bandit/flat-penalised-bonus", "bandit/flat/penalised", "ppo.ent_coef", (0.0,), "entropy bonus"),
 )
+GRIDS_BY_NAME: dict[str, Grid] = {grid.name: grid for grid in GRIDS}
 
 # What interleaved rows have besides their regulariser: annealing. The paper's rows with it, to tell the two apart.
 ANNEALED: tuple[Experiment, ...] = tuple(

@@ -346,14 +346,14 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
         seconds += sum(curve.seconds[-1] for sample in _one_per_run(results, row) if (curve := results.curve(sample)))
     versions = tuple((name, version, str(count)) for (name, version), count in sorted(found.items()))
     begun = read_origin(results.study.runs)
-    commit = f" at commit {begun.commit}" if begun.commit else ""
+    commit = f"; its first ones were begun at commit {begun.commit}" if begun.commit else ""
     spent = f"{steps / 1e6:,.1f} M control steps and {seconds / 3600:.1f} hours of one core in training alone"
     here = f"footwork {footwork.__version__}, Python {platform.python_version()}"
     quick = "" if results.study.size.short is None else " --quick"
     made = [f"footwork reproduce{quick} --rows {in_braces(group)} --seeds {n}" for n, group in sorted(by_count.items())]
     again = "footwork report --runs results --to .  # in this folder: the same report from the files beside it"
     return [
-        Text(f"The runs that are in it, begun{commit} (seeds 0, 1, ... of each row):"),
+        Text(f"The runs that are in it (seeds 0, 1, ... of each row{commit}):"),
         Code("\n".join(reversed(made))),
         Text("The report:"),
         Code(f"{command}\n{again}"),

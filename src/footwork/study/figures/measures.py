@@ -141,9 +141,9 @@ def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
-    """B as a number or as a size, the potential, the heavy and the light ant: rows side by side, in three metrics."""
-    tasks = [row for grid in _COMPARED if "walker" not in grid.base for row in grid.points().values()]
-    walkers = [row for grid in _COMPARED if "walker" in grid.base for row in grid.points().values()]
+    """B, the potential, the entropy bonus, annealing, the ant: rows side by side, in three metrics."""
+    tasks = [row for grid in _COMPARED_GRIDS if "walker" not in grid.base for row in grid.points().values()]
+    walkers = [row for grid in _COMPARED_GRIDS if "walker" in grid.base for row in grid.points().values()]
     lines = (
         ("B, the potential and the entropy bonus: masters, flat policies", tasks, ("way", "route", "success")),
         (
@@ -162,7 +162,9 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
     return figure
 
 
-_COMPARED = tuple(grid for grid in GRIDS if grid.field in ("ppo.minibatch_size", "task.potential", "ppo.ent_coef"))
+_COMPARED_GRIDS = tuple(
+    grid for grid in GRIDS if grid.field in ("ppo.minibatch_size", "task.potential", "ppo.ent_coef")
+)
 _OF_ANTS = tuple(
     f"{ant}{row}"
     for row in ("walker/plain", "walker/interleaved", "maze/hrl/plain", "maze/hrl/interleaved")
@@ -173,7 +175,7 @@ _ANNEALED = tuple(row for one in ANNEALED for row in (one.name.replace("ablation
 COMPARED: tuple[str, ...] = tuple(
     dict.fromkeys(
         (
-            *(row for grid in _COMPARED for row in grid.points().values()),
+            *(row for grid in _COMPARED_GRIDS for row in grid.points().values()),
             *_ANNEALED,
             *_OF_ANTS,
         )

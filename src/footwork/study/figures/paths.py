@@ -158,7 +158,7 @@ def flat_ends(results: Results, rows: tuple[str, ...]) -> Any:
         _draw_arena(ax, arena, None)
         _crop(ax, arena)
         for entry in entries:
-            ax.plot(*np.array(entry["ends"]).T, ".", ms=2.5, color="#0072B2", alpha=0.5, zorder=4, mew=0)
+            ax.plot(*np.array(entry["ends"]).T, ".", ms=2.5, color="#0072B2", alpha=0.5, zorder=7, mew=0)
         stop = straight_line_stop(arena)
         if stop is not None:
             ax.add_patch(Circle(stop, STUCK_WITHIN, fc="none", ec="#E69F00", lw=1.5, zorder=6))
@@ -167,5 +167,6 @@ def flat_ends(results: Results, rows: tuple[str, ...]) -> Any:
         words = "no finished runs yet" if share is None else f"{100 * share:.0f} % in the circle, {seeds}"
         ax.set_title(f"{row.removeprefix('maze/')}\n{words}", fontsize=8)
     end = Line2D([], [], marker=".", ls="", color="#0072B2", label="end of an episode")
-    figure.legend(handles=[*_places(), end], loc="outside lower center", ncols=3)
+    circle = Line2D([], [], marker="o", ls="", mfc="none", mec="#E69F00", ms=12, label="at the wall")
+    figure.legend(handles=[*_places(), circle, end], loc="outside lower center", ncols=4)
     return figure

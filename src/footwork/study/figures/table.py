@@ -212,7 +212,8 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "17-flat-ends",
         "Where the episodes of flat policies end",
-        "A point per episode, all seeds. Circle: within 1 m of where the straight line to the goal meets the wall.",
+        "A point per episode, all seeds, and the share of all episodes that end in the circle: within 1 m of where the "
+        "straight line to the goal meets the wall.",
         paths.flat_ends,
         tuple(f"maze/flat/{kind}" for kind in ("free", "penalised", "guided-free", "guided-penalised")),
     ),
@@ -233,7 +234,7 @@ FIGURES: tuple[Figure, ...] = (
         "19-choices",
         "What the paper leaves open: B, the potential, the ant, the entropy bonus; and annealing",
         "IQM over seeds with 95 % intervals; in brackets the number of seeds. There are walls to go around on AntMaze "
-        "only.",
+        "only. Rows named after the bonus have none, those below them 0.02.",
         measures.comparisons,
         measures.COMPARED,
         once=True,

@@ -37,7 +37,43 @@ def test_a_run_directory_tells_what_it_was_made_with(run):
     assert again.config() == CONFIG
     stored = json.loads((run.path / "config.json").read_text())["versions"]
     assert stored == record.versions()
-    assert set(stored) == {"footwork", "source", "python", "jax", "mujoco", "numpy", "platform"}
+    assert set(stored) - {"commit"} == {"footwork", "source", "python", "jax", "mujoco", "numpy", "platform"}
+
+
+def test_a_commit_is_named_only_of_a_source_that_is_as_it_was_committed(tmp_path, monkeypatch):
+    def git(*arguments: str) -> str:
+        who = ("-c", "user.name=A", "-c", "user.email=a@b.invalid")
+        return subprocess.run(
+            ("git", *who, *arguments), cwd=tmp_path, check=True, capture_output=True, text=True
+        ).stdout
+
+    def commit() -> str:
+        record.source_commit.cache_clear()
+        return record.source_commit()
+
+    package = tmp_path / "src" / "footwork" / "__init__.py"
+    package.parent.mkdir(parents=True)
+    package.write_text("one = 1\n")
+    monkeypatch.setattr(record.footwork, "__file__", str(package))
+    try:
+        git("init", "-q")
+        assert commit() == ""  # in a repository that does not hold it, as in somebody's .venv
+        git("add", ".")
+        git("commit", "-q", "-m", "first")
+        head = git("rev-parse", "--short", "HEAD").strip()
+        assert commit() == head
+        assert record.versions()["commit"] == head
+        (tmp_path / "notes.txt").write_text("not the package's")
+        assert commit() == head
+        package.write_text("one = 2\n")
+        assert commit() == ""
+        package.write_text("one = 1\n")
+        (package.parent / "new.py").write_text("")
+        assert commit() == ""
+        monkeypatch.setenv("PATH", "")
+        assert commit() == ""  # no git
+    finally:
+        record.source_commit.cache_clear()
 
 
 def test_a_run_is_never_overwritten(run):

@@ -33,6 +33,7 @@ import math
 import os
 import platform
 import re
+import subprocess
 import sys
 import time
 import types
@@ -394,10 +395,14 @@ def config_from_json(cls: type[_Config], data: Any) -> _Config:
 
 
 def versions() -> dict[str, str]:
-    """Of what a run's numbers depend on: the package, its source, Python, the libraries and the platform."""
+    """Of what a run's numbers depend on: the package, its source, Python, the libraries and the platform.
+
+    The source's commit is among them where it is known (:func:`source_commit`).
+    """
     found = {
         "footwork": str(getattr(footwork, "__version__", "unknown")),
         "source": source_digest(),
+        **({"commit": commit} if (commit := source_commit()) else {}),
         "python": platform.python_version(),
     }
     for name in ("jax", "mujoco", "numpy"):
@@ -417,6 +422,23 @@ def source_digest() -> str:
     for path in sorted(package.rglob("*.py")):
         digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
+
+
+@functools.cache
+def source_commit() -> str:
+    """The commit of the package's source, if it lies in a repository and is as that commit has it; else empty."""
+    package = Path(footwork.__file__).parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(
+            ("git", "-C", str(package), *arguments), capture_output=True, text=True, timeout=10, check=True
+        ).stdout.strip()
+
+    try:
+        tracked = git("ls-files", "--error-unmatch", "__init__.py")
+        return git("rev-parse", "--short", "HEAD") if tracked and not git("status", "--porcelain", "--", ".") else ""
+    except (OSError, subprocess.SubprocessError):
+        return ""
 
 
 class Progress:
@@ -666,6 +688,7 @@ __all__ = [
     "config_from_json",
     "config_to_json",
     "read_metrics",
+    "source_commit",
     "source_digest",
     "truncate_metrics",
     "versions",

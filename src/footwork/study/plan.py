@@ -11,11 +11,10 @@ import contextlib
 import json
 import os
 import platform
-import subprocess
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import footwork
 from footwork import checkpoint
@@ -166,7 +165,6 @@ def mark(study: Study) -> None:
         raise RunError(f"{study.runs} holds runs of their full length, not of the quick study: choose another --runs")
     study.runs.mkdir(parents=True, exist_ok=True)
     content = {"format": _FORMAT, "size": study.size.name, "footwork": footwork.__version__, "machine": _machine()}
-    content |= {"commit": commit} if (commit := _commit()) else {}
     checkpoint.write_atomically(path, json.dumps(content).encode() + b"\n")
 
 
@@ -188,35 +186,11 @@ def read_mark(runs: Path) -> Size:
         raise RunError(f"{path} is damaged or of another version of footwork") from None
 
 
-class Origin(NamedTuple):
-    """Where a study was begun; empty where that is not known."""
-
-    machine: str  # in words
-    commit: str  # of the package's repository, if it lay in one as it was committed
-
-
-def read_origin(runs: Path) -> Origin:
-    """What the folder's mark says of its beginning."""
+def read_machine(runs: Path) -> str:
+    """The machine on which the study there was begun, in words; empty where that is not known."""
     try:
-        content = json.loads((runs / STUDY_FILE).read_bytes())
-        return Origin(str(content.get("machine", "")), str(content.get("commit", "")))
+        return str(json.loads((runs / STUDY_FILE).read_bytes()).get("machine", ""))
     except (OSError, ValueError, AttributeError, RecursionError):
-        return Origin("", "")
-
-
-def _commit() -> str:
-    """The commit of the package's source, if it is as that commit has it."""
-    package = Path(footwork.__file__).parent
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(
-            ("git", "-C", str(package), *arguments), capture_output=True, text=True, timeout=10, check=True
-        ).stdout.strip()
-
-    try:
-        tracked = git("ls-files", "--error-unmatch", "__init__.py")
-        return git("rev-parse", "--short", "HEAD") if tracked and not git("status", "--porcelain", "--", ".") else ""
-    except (OSError, subprocess.SubprocessError):
         return ""
 
 

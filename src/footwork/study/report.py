@@ -25,7 +25,7 @@ from footwork.study.figures import FIGURES, Drawn, count_in_words, draw_figures
 from footwork.study.judging import Finding, Judgement, judge_all, show_bound, show_chance, show_effect
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import Block, Bullets, Code, Heading, Picture, TableBlock, Text, markdown, page
-from footwork.study.plan import default_rows, plan, read_origin
+from footwork.study.plan import default_rows, plan, read_machine
 from footwork.study.report_files import RESULTS, check_place, export
 from footwork.study.results import Results, Sample, all_rows, prefixes_at_hand, seeds_in_words
 from footwork.train import planned_steps, steps_per_iteration
@@ -345,21 +345,20 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
                 found[name, str(version)] = found.get((name, str(version)), 0) + 1
         seconds += sum(curve.seconds[-1] for sample in _one_per_run(results, row) if (curve := results.curve(sample)))
     versions = tuple((name, version, str(count)) for (name, version), count in sorted(found.items()))
-    begun = read_origin(results.study.runs)
-    commit = f"; its first ones were begun at commit {begun.commit}" if begun.commit else ""
     spent = f"{steps / 1e6:,.1f} M control steps and {seconds / 3600:.1f} hours of one core in training alone"
+    machine = read_machine(results.study.runs) or "not recorded"
     here = f"footwork {footwork.__version__}, Python {platform.python_version()}"
     quick = "" if results.study.size.short is None else " --quick"
     made = [f"footwork reproduce{quick} --rows {in_braces(group)} --seeds {n}" for n, group in sorted(by_count.items())]
     again = "footwork report --runs results --to .  # in this folder: the same report from the files beside it"
     return [
-        Text(f"The runs that are in it (seeds 0, 1, ... of each row{commit}):"),
+        Text("The runs that are in it (seeds 0, 1, ... of each row):"),
         Code("\n".join(reversed(made))),
         Text("The report:"),
         Code(f"{command}\n{again}"),
         Text(
-            f"Machine on which the study was begun: {begun.machine or 'not recorded'}; {spent}. Report written by "
-            f"{here}, source {source_digest()}. Where something has two versions here, not all runs are of one make."
+            f"Machine on which the study was begun: {machine}; {spent}. Report written by {here}, "
+            f"source {source_digest()}. Where something has two versions here, not all runs are of one make."
         ),
         TableBlock(("version of", "is", "runs"), versions),
     ]

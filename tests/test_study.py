@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,18 @@ from footwork.doors.cli import run
 from footwork.evaluate import Episodes
 from footwork.record import RunDir, RunError, read_metrics
 from footwork.statistics import Effect, iqm
-from footwork.study import answers, claims, judging, measure, plan, report, report_files, results, training_curves
+from footwork.study import (
+    answers,
+    claims,
+    judging,
+    measure,
+    plan,
+    report,
+    report_files,
+    results,
+    row_tables,
+    training_curves,
+)
 from footwork.study.experiments import EXPERIMENTS, GRIDS, GRIDS_BY_NAME, MAIN, find_row, is_row, match_rows
 from footwork.study.figures import FIGURES, draw_figures, find_figures, style
 from footwork.study.metrics import METRICS
@@ -572,6 +584,11 @@ def test_shown_comparisons_do_not_decide_and_rows_of_ablations_do_not_ask_for_te
     assert len(shown) == 3
     assert all(find_row(row).ppo.anneal_updates == find_row("walker/interleaved").ppo.anneal_updates for row in shown)
     assert find_row("ablation/annealed/appropriate-bias").needs == "ablation/annealed/plain"
+    master = find_row("ablation/maze/hrl-annealed/random-start")
+    assert master.needs == "ablation/annealed/random-start"
+    assert replace(master, name="", sub_policies="") == replace(
+        find_row("maze/hrl/random-start"), name="", sub_policies=""
+    )
     assert not any(row.startswith("ablation/") for row in claims.rows_read())
     assert {"walker/plain", "walker/interleaved"} <= set(claims.rows_read())
     fill(study, ("light/walker/plain",), 2)
@@ -757,14 +774,45 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
             assert a.effect is b.effect is None or a.effect == pytest.approx(b.effect, rel=1e-3)
 
 
-def test_the_readme_shows_the_claims_as_the_report_does():
+def test_the_readme_shows_the_tables_of_the_report(monkeypatch):
     """Copied line by line, so that neither can say what the other does not."""
     root = Path(__file__).parents[1]
-    readme, said = ((root / name).read_text().splitlines() for name in ("README.md", "report/REPORT.md"))
-    section = readme[readme.index("## The study so far") :]
-    shown = [line for line in section[: section.index("## What you can do")] if line.startswith("| ")]
-    assert len(shown) > 3
-    assert not [line for line in shown if line not in said]
+    monkeypatch.syspath_prepend(str(root / "tools"))
+    import readme_tables
+
+    readme, said = ((root / name).read_text() for name in ("README.md", "report/REPORT.md"))
+    assert readme_tables.with_tables(readme, said) == readme, "run tools/readme_tables.py"
+    changed = readme_tables.with_tables(readme, re.sub(r"\d seeds", "77 seeds", said).replace("| plain |", "| bare |"))
+    assert "77 seeds" in changed
+    assert "| bare |" in changed
+
+
+def test_kinds_of_sub_policies_stand_side_by_side_with_their_masters(study):
+    fill(study, ("walker/plain", "bandit/hrl/plain", "light/walker/plain", "maze/flat/guided-free"), 3)
+    fill(study, ("maze/paper/plain",), 1)
+    fill(study, ("bandit/flat/free", "ablation/annealed/plain"), claims.MIN_SEEDS)
+    fill(study, ("ablation/maze/hrl-annealed/plain",), 2)
+    found = results.Results(study)
+    table = row_tables.side_by_side(found)
+    lines = {line[0]: dict(zip(table.header, line, strict=True)) for line in table.rows}
+    assert list(lines) == ["plain", "plain, annealed", "flat policy, free", "light/plain"]
+
+    def interval(row: str, metric: str) -> str:
+        return METRICS[metric].with_interval(found.middle(row, metric))
+
+    assert lines["plain"]["idle, k = 50"] == interval("walker/plain", "idle") + " (3)"
+    assert lines["plain"]["AntBandit, our reward"] == interval("bandit/hrl/plain", "success") + " (3)"
+    assert lines["plain"]["AntMaze, our reward"] == "-"  # a row without runs
+    one = METRICS["success"].number(found.scores("maze/paper/plain", "success")[0])
+    assert lines["plain"]["AntMaze, the paper's"] == f"{one} (1)"  # and no interval
+    assert lines["plain, annealed"]["hand-overs"] == interval("ablation/annealed/plain", "handover")
+    annealed = interval("ablation/maze/hrl-annealed/plain", "success") + " (2)"
+    assert lines["plain, annealed"]["AntMaze, our reward"] == annealed
+    assert lines["plain, annealed"]["AntMaze, the paper's"] == ""  # there is no such row
+    assert lines["flat policy, free"]["m/s"] == ""
+    assert lines["flat policy, free"]["AntMaze, our reward"] == interval("maze/flat/guided-free", "success") + " (3)"
+    assert lines["flat policy, free"]["AntBandit, the paper's"] == interval("bandit/flat/free", "success")
+    assert lines["light/plain"]["upside down, k = 50"] == interval("light/walker/plain", "upside down") + " (3)"
 
 
 def test_figures_of_which_there_is_one_are_not_drawn_under_another_ant(study, tmp_path):

@@ -379,6 +379,18 @@ CLAIMS: tuple[Claim, ...] = (
                 )
                 for kind in PAPER_REGULARISERS
             ),
+            *(
+                _greater(
+                    f"maze, against {kind}, annealed{how}",
+                    "maze/{schedule}/interleaved",
+                    f"ablation/maze/{{schedule}}-annealed/{kind}",
+                    metric,
+                    0.05,
+                    decides=False,
+                )
+                for kind in PAPER_REGULARISERS
+                for metric, how in (("way", ""), ("success", ", success"))
+            ),
         ),
         everywhere=True,
     ),

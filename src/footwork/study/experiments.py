@@ -238,6 +238,13 @@ ANNEALED: tuple[Experiment, ...] = tuple(
     )
     for row in WALKERS[:4]
 )
+# And masters on those.
+ANNEALED_MASTERS: tuple[Experiment, ...] = tuple(
+    replace(MAIN[f"{place}/hrl/{kind}"], name=f"ablation/{place}/hrl-annealed/{kind}", sub_policies=row.name)
+    for place in ("bandit", "maze")
+    for row in ANNEALED
+    for kind in (row.name.rpartition("/")[2],)
+)
 
 # Rows of the light ant: what claims 7 to 12 and 14 read.
 LIGHT_KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias", "interleaved")
@@ -274,7 +281,7 @@ def with_robot(experiment: Experiment, robot: Robot) -> Experiment:
 EXPERIMENTS: dict[str, Experiment] = {
     **MAIN,
     **{row.name: row for grid in GRIDS for row in grid.rows()},
-    **{row.name: row for row in ANNEALED},
+    **{row.name: row for row in (*ANNEALED, *ANNEALED_MASTERS)},
     **{row.name: row for row in (_of_robot(MAIN[name], ROBOTS["light"]) for name in LIGHT)},
 }
 

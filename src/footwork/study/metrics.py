@@ -145,11 +145,17 @@ def _ended_within(radius: float, place: Callable[[Arena], Point | None], results
     return float(np.mean(np.hypot(*(np.array(entry["ends"], np.float64) - np.array(where)).T) <= radius))
 
 
-def _moving(results: Results, sample: Sample) -> float | None:
-    """Options of random switching in which the ant moves on along its direction at all, 0.2 m/s or more."""
+def _switched(name: str, results: Results, sample: Sample) -> float | None:
+    """A share under random switching, of options or, in the end, of ants."""
     entry = results.entry(sample, TRANSITIONS)
     found = None if entry is None else entry["switching"].get(str(SWITCHED_EVERY))
-    return None if found is None else 1.0 - found["idle"]
+    return None if found is None else float(found[name])
+
+
+def _moving(results: Results, sample: Sample) -> float | None:
+    """Options of random switching in which the ant moves on along its direction at all, 0.2 m/s or more."""
+    idle = _switched("idle", results, sample)
+    return None if idle is None else 1.0 - idle
 
 
 def _transitions(results: Results, sample: Sample) -> float | None:
@@ -186,6 +192,14 @@ METRICS: dict[str, Metric] = {
     ),
     "handover": Metric("orthogonal hand-overs that succeed", _handover),
     "moving": Metric(f"options that move the ant, switched at random every {SWITCHED_EVERY} control steps", _moving),
+    "idle": Metric(
+        f"options that hardly move the ant, switched at random every {SWITCHED_EVERY} control steps",
+        partial(_switched, "idle"),
+    ),
+    "upside down": Metric(
+        f"ants upside down after random switching every {SWITCHED_EVERY} control steps",
+        partial(_switched, "upside_down"),
+    ),
     "transitions": Metric("changes of sub-policy", _transitions, "per episode"),
     "speed": Metric("speed along the direction", _speed, "m/s"),
 }

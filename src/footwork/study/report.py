@@ -12,8 +12,6 @@ import platform
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 import footwork
 from footwork.checkpoint import write_atomically
 from footwork.evaluate import HANDOVER_AFTER, HANDOVER_SPEED, HANDOVER_STEPS, IDLE_SPEED, SWITCHING_STEPS
@@ -27,7 +25,8 @@ from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import Block, Bullets, Code, Heading, Picture, TableBlock, Text, markdown, page
 from footwork.study.plan import default_rows, plan, read_machine
 from footwork.study.report_files import RESULTS, check_place, export
-from footwork.study.results import Results, Sample, all_rows, prefixes_at_hand, seeds_in_words
+from footwork.study.results import Results, all_rows, prefixes_at_hand, seeds_in_words
+from footwork.study.row_tables import SIDE_BY_SIDE, side_by_side, sub_policies, task_policies
 from footwork.train import planned_steps, steps_per_iteration
 
 
@@ -69,10 +68,13 @@ def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> lis
             )
         )
     blocks += [Heading("Claims"), _overview_table(judgements), Heading("How to read this", 3), Bullets(_reading())]
+    blocks += [Heading("Side by side"), side_by_side(results), Text(SIDE_BY_SIDE)]
     blocks += [Heading("The paper, in its order"), _answers_table(judgements, results)]
     blocks += [Heading("What the paper leaves open, and what we took", 3), _choices_table(results)]
     blocks += [Heading("Figures"), *[Picture(d, _facts(results)) for d in drawn]]
-    blocks += [Heading("Rows"), _rows_table(results, rows), Text(_rows_read(results))]
+    blocks += [Heading("Rows"), Text(_rows_read(results))]
+    for title, table in (("Sub-policies", sub_policies), ("Masters and flat policies", task_policies)):
+        blocks += [Heading(title, 3), table(results, rows)]
     blocks += [Heading("Each claim in each setting"), _claims_table(judgements)]
     blocks += [Heading("Every comparison"), _comparisons_table(judgements)]
     made = _made(results, rows, command)  # reads files, and so may find problems with them
@@ -115,8 +117,10 @@ def _rows_read(results: Results) -> str:
         "Interquartile means over seeds with 95 % intervals. Control steps: of one run, all its directions counted. "
         "Minutes: of training, mean over runs, one core each, without the measuring that follows "
         f"({results.study.size.episodes} episodes, drawn from the policy and not its mean, or the hand-over matrix and "
-        "random switching). Way: along the straight line. One row with what it stands on: "
-        "`footwork reproduce --rows ROW`."
+        "random switching). Hand-overs: orthogonal ones that succeed. Idle, upside down: options that hardly move the "
+        f"ant, and ants in the end, switched at random every {SWITCHED_EVERY} control steps. Way: along the straight "
+        "line. Within: episodes that come so near to the goal. Turned over: at any time of an episode. One row with "
+        "what it stands on: `footwork reproduce --rows ROW`."
     )
 
 
@@ -257,50 +261,6 @@ def _answers_table(judgements: Sequence[Judgement], results: Results) -> TableBl
     return TableBlock(("section", "the paper says", "answer", "figures"), rows)
 
 
-def _rows_table(results: Results, rows: Sequence[str]) -> TableBlock:
-    of_walkers, of_tasks = ("handover", "speed", "return"), ("way", "route", "success", "success close")
-    lines = []
-    for row in rows:
-        mine = of_walkers if find_row(row).is_walker else of_tasks
-        cells = [_shown(results, row, name) if name in mine else "" for name in (*of_tasks, *of_walkers)]
-        minutes = [curve.seconds[-1] / 60 for sample in _one_per_run(results, row) if (curve := results.curve(sample))]
-        steps = sorted({_steps(sample) for sample in results.samples(row)})
-        taken = " to ".join(f"{n:,}" for n in dict.fromkeys((steps[0], steps[-1])))
-        wall = f"{np.mean(minutes):.1f}" if minutes else "-"
-        lines.append((row, str(len(results.samples(row))), taken, wall, *cells))
-    header = (
-        "row",
-        "seeds",
-        "control steps",
-        "minutes",
-        "way",
-        "around walls",
-        "within 1 m",
-        "0.5 m",
-        "hand-overs",
-        "m/s",
-        "training return",
-    )
-    return TableBlock(header, tuple(lines))
-
-
-def _one_per_run(results: Results, row: str) -> list[Sample]:
-    """A seed of each run: several may have been trained in one batch."""
-    return list({sample.run.path: sample for sample in results.samples(row)}.values())
-
-
-def _steps(sample: Sample) -> int:
-    """Control steps that a seed took, all its directions counted."""
-    return int(sample.run.summary()["steps"]) * sample.experiment.runs_per_seed
-
-
-def _shown(results: Results, row: str, metric: str) -> str:
-    effect, kind = results.middle(row, metric), METRICS[metric]
-    if effect is None:
-        return "-"
-    return kind.with_interval(effect, alone=len(results.samples(row)) == 1) + (" %" if kind.is_share else "")
-
-
 def _choices_table(results: Results) -> TableBlock:
     return TableBlock(("what", "here"), tuple((choice.what, choice.here) for choice in choices(results.study)))
 
@@ -340,10 +300,10 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
         samples = results.samples(row)
         by_count.setdefault(len(samples), []).append(row)
         for sample in samples:
-            steps += _steps(sample)
+            steps += sample.control_steps
             for name, version in sample.run.versions().items():
                 found[name, str(version)] = found.get((name, str(version)), 0) + 1
-        seconds += sum(curve.seconds[-1] for sample in _one_per_run(results, row) if (curve := results.curve(sample)))
+        seconds += sum(results.training_seconds(row))
     versions = tuple((name, version, str(count)) for (name, version), count in sorted(found.items()))
     spent = f"{steps / 1e6:,.1f} M control steps and {seconds / 3600:.1f} hours of one core in training alone"
     machine = read_machine(results.study.runs) or "not recorded"

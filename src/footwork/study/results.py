@@ -39,6 +39,15 @@ class Sample:
     index: int  # of the seed in the run
     experiment: Experiment
 
+    @property
+    def control_steps(self) -> int:
+        """What this seed took, all its directions counted.
+
+        Raises:
+            RunError: the run's summary cannot be read.
+        """
+        return int(self.run.summary()["steps"]) * self.experiment.runs_per_seed
+
 
 class LeftOut(NamedTuple):
     """A run that does not count, and why."""
@@ -86,6 +95,11 @@ class Results:
         """The training curve of a sample; None, and a problem, where it cannot be read."""
         whole = self.whole_curve(sample)
         return None if whole is None else of_seed(whole, sample.experiment, sample.index)
+
+    def training_seconds(self, row: str) -> list[float]:
+        """How long each run of a row trained; several seeds may have been trained in one."""
+        one_per_run = {sample.run.path: sample for sample in self.samples(row)}.values()
+        return [float(curve.seconds[-1]) for sample in one_per_run if (curve := self.curve(sample)) is not None]
 
     def measurements(self, row: str, name: str) -> list[dict[str, Any]]:
         """The entries of a file of measurements, one per seed that has them."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from footwork.arena import DIRECTIONS
 from footwork.statistics import Effect, Floats, contrast, generator_for, iqm, profile_band
-from footwork.study.experiments import ANNEALED, GRIDS, Grid
+from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, GRIDS, Grid
 from footwork.study.figures.style import Look, empty, interval_marks, label_of, legend_below, look_of, panels, seeds_of
 from footwork.study.measure import TRANSITIONS
 from footwork.study.metrics import METRICS
@@ -151,7 +151,11 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
             [*walkers, *_ANNEALED, *(row for row in _OF_ANTS if "walker/" in row)],
             ("handover", "moving", "speed"),
         ),
-        ("the ant: masters", [row for row in _OF_ANTS if "walker/" not in row], ("way", "route", "success")),
+        (
+            "annealing and the ant: masters",
+            [*_ANNEALED_MASTERS, *(row for row in _OF_ANTS if "walker/" not in row)],
+            ("way", "route", "success"),
+        ),
     )
     figure, axes = panels(3, 3, 2.2)
     axes[0, 0].get_gridspec().set_height_ratios([len(set(names)) + 2 for _, names, _ in lines])
@@ -171,12 +175,19 @@ _OF_ANTS = tuple(
     for ant in ("", "light/")
 )
 _ANNEALED = tuple(row for one in ANNEALED for row in (one.name.replace("ablation/annealed", "walker"), one.name))
+_ANNEALED_MASTERS = tuple(
+    row
+    for one in ANNEALED_MASTERS
+    if "/maze/" in one.name
+    for row in (one.name.removeprefix("ablation/").replace("-annealed", ""), one.name)
+)
 # What :func:`comparisons` reads.
 COMPARED: tuple[str, ...] = tuple(
     dict.fromkeys(
         (
             *(row for grid in _COMPARED_GRIDS for row in grid.points().values()),
             *_ANNEALED,
+            *_ANNEALED_MASTERS,
             *_OF_ANTS,
         )
     )

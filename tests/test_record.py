@@ -41,11 +41,15 @@ def test_a_run_directory_tells_what_it_was_made_with(run):
 
 
 def test_a_commit_is_named_only_of_a_source_that_is_as_it_was_committed(tmp_path, monkeypatch):
+    for name in [name for name in os.environ if name.startswith("GIT_")]:  # as in a hook, of another repository
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("GIT_CONFIG_GLOBAL", os.devnull)
+    monkeypatch.setenv("GIT_CONFIG_NOSYSTEM", "1")
+
     def git(*arguments: str) -> str:
         who = ("-c", "user.name=A", "-c", "user.email=a@b.invalid")
-        return subprocess.run(
-            ("git", *who, *arguments), cwd=tmp_path, check=True, capture_output=True, text=True
-        ).stdout
+        done = subprocess.run(("git", *who, *arguments), cwd=tmp_path, check=True, capture_output=True, text=True)
+        return done.stdout.strip()
 
     def commit() -> str:
         record.source_commit.cache_clear()
@@ -60,11 +64,17 @@ def test_a_commit_is_named_only_of_a_source_that_is_as_it_was_committed(tmp_path
         assert commit() == ""  # in a repository that does not hold it, as in somebody's .venv
         git("add", ".")
         git("commit", "-q", "-m", "first")
-        head = git("rev-parse", "--short", "HEAD").strip()
-        assert commit() == head
-        assert record.versions()["commit"] == head
+        first = git("rev-parse", "HEAD")[:7]
+        assert commit() == first
+        assert record.versions()["commit"] == first
         (tmp_path / "notes.txt").write_text("not the package's")
-        assert commit() == head
+        assert commit() == first
+        git("add", ".")
+        git("commit", "-q", "-m", "notes")
+        assert commit() == first
+        monkeypatch.setenv("GIT_DIR", str(tmp_path / "elsewhere"))  # in a hook
+        assert commit() == first
+        monkeypatch.delenv("GIT_DIR")
         package.write_text("one = 2\n")
         assert commit() == ""
         package.write_text("one = 1\n")

@@ -580,8 +580,8 @@ def test_a_difference_of_the_other_sign_is_told_from_one_that_is_too_small(study
 
 def test_shown_comparisons_do_not_decide_and_rows_of_ablations_do_not_ask_for_ten_seeds(study):
     fourteen = claims.CLAIMS[13]
-    shown = [row for c in fourteen.contrasts if not c.decides for row in c.rows if row.startswith("ablation/annealed/")]
-    assert len(shown) == 3
+    shown = {row for c in fourteen.contrasts if not c.decides for row in c.rows if row.startswith("ablation/annealed/")}
+    assert shown == {f"ablation/annealed/{kind}" for kind in claims.PAPER_REGULARISERS}
     assert all(find_row(row).ppo.anneal_updates == find_row("walker/interleaved").ppo.anneal_updates for row in shown)
     assert find_row("ablation/annealed/appropriate-bias").needs == "ablation/annealed/plain"
     master = find_row("ablation/maze/hrl-annealed/random-start")
@@ -780,11 +780,27 @@ def test_the_readme_shows_the_tables_of_the_report(monkeypatch):
     monkeypatch.syspath_prepend(str(root / "tools"))
     import readme_tables
 
-    readme, said = ((root / name).read_text() for name in ("README.md", "report/REPORT.md"))
+    readme, said = ((root / name).read_text(encoding="utf-8") for name in ("README.md", "report/REPORT.md"))
     assert readme_tables.with_tables(readme, said) == readme, "run tools/readme_tables.py"
     changed = readme_tables.with_tables(readme, re.sub(r"\d seeds", "77 seeds", said).replace("| plain |", "| bare |"))
     assert "77 seeds" in changed
     assert "| bare |" in changed
+
+
+def write_switching(study, row, seed, idle, upside_down):
+    """What random switching every 50 control steps showed of a fake run."""
+    path = study.runs / row / f"seed-{seed}" / "transitions.json"
+    content = json.loads(path.read_text())
+    content["by_seed"][0]["switching"]["50"] |= {"idle": idle, "upside_down": upside_down}
+    write(path, content)
+
+
+def write_success(study, row, seed, success):
+    path = study.runs / row / f"seed-{seed}" / "evaluation.json"
+    content = json.loads(path.read_text())
+    content["by_seed"][0]["success"] |= {"1.0": success}
+    content["by_seed"][0] |= {"flip_rate": 0.07}
+    write(path, content)
 
 
 def test_kinds_of_sub_policies_stand_side_by_side_with_their_masters(study):
@@ -792,27 +808,55 @@ def test_kinds_of_sub_policies_stand_side_by_side_with_their_masters(study):
     fill(study, ("maze/paper/plain",), 1)
     fill(study, ("bandit/flat/free", "ablation/annealed/plain"), claims.MIN_SEEDS)
     fill(study, ("ablation/maze/hrl-annealed/plain",), 2)
+    for seed, idle in enumerate((0.30, 0.40, 0.50)):
+        write_switching(study, "walker/plain", seed, idle, 0.1)
+        write_switching(study, "light/walker/plain", seed, 0.0, 0.2)
+    for seed in range(claims.MIN_SEEDS):
+        write_switching(study, "ablation/annealed/plain", seed, 0.6, 0.9)
+        write_success(study, "bandit/flat/free", seed, 0.25)
+    for seed in range(3):
+        write_success(study, "bandit/hrl/plain", seed, (0.5, 0.6, 0.7)[seed])
+        write_success(study, "maze/flat/guided-free", seed, 0.75)
+    for seed in range(2):
+        write_success(study, "ablation/maze/hrl-annealed/plain", seed, 0.125)
+    write_success(study, "maze/paper/plain", 0, 0.0)
     found = results.Results(study)
     table = row_tables.side_by_side(found)
-    lines = {line[0]: dict(zip(table.header, line, strict=True)) for line in table.rows}
+    assert table.header[:4] == ("sub-policies", "hand-overs", "idle, k = 50", "upside down, k = 50")
+    assert table.header[4:] == (
+        "AntBandit, our reward",
+        "AntMaze, our reward",
+        "AntBandit, the paper's",
+        "AntMaze, the paper's",
+    )
+    lines = {line[0]: [*line[2:]] for line in table.rows}
     assert list(lines) == ["plain", "plain, annealed", "flat policy, free", "light/plain"]
+    assert lines["plain"][0].startswith("40.0 [30.0, 50.0]")
+    assert lines["plain"][1:] == ["10.0 [10.0, 10.0] (3)", "60.0 [50.0, 70.0] (3)", "-", "-", "0.0 (1)"]
+    assert lines["plain, annealed"] == ["60.0 [60.0, 60.0]", "90.0 [90.0, 90.0]", "-", "12.5 [12.5, 12.5] (2)", "", ""]
+    assert lines["flat policy, free"] == ["", "", "-", "75.0 [75.0, 75.0] (3)", "25.0 [25.0, 25.0]", "-"]
+    assert lines["light/plain"][:2] == ["0.0 [0.0, 0.0] (3)", "20.0 [20.0, 20.0] (3)"]
+    assert "four sub-policies 8 M, a symmetric one 4 M" in row_tables.side_by_side_caption(found)
 
-    def interval(row: str, metric: str) -> str:
-        return METRICS[metric].with_interval(found.middle(row, metric))
 
-    assert lines["plain"]["idle, k = 50"] == interval("walker/plain", "idle") + " (3)"
-    assert lines["plain"]["AntBandit, our reward"] == interval("bandit/hrl/plain", "success") + " (3)"
-    assert lines["plain"]["AntMaze, our reward"] == "-"  # a row without runs
-    one = METRICS["success"].number(found.scores("maze/paper/plain", "success")[0])
-    assert lines["plain"]["AntMaze, the paper's"] == f"{one} (1)"  # and no interval
-    assert lines["plain, annealed"]["hand-overs"] == interval("ablation/annealed/plain", "handover")
-    annealed = interval("ablation/maze/hrl-annealed/plain", "success") + " (2)"
-    assert lines["plain, annealed"]["AntMaze, our reward"] == annealed
-    assert lines["plain, annealed"]["AntMaze, the paper's"] == ""  # there is no such row
-    assert lines["flat policy, free"]["m/s"] == ""
-    assert lines["flat policy, free"]["AntMaze, our reward"] == interval("maze/flat/guided-free", "success") + " (3)"
-    assert lines["flat policy, free"]["AntBandit, the paper's"] == interval("bandit/flat/free", "success")
-    assert lines["light/plain"]["upside down, k = 50"] == interval("light/walker/plain", "upside down") + " (3)"
+def test_rows_have_a_table_for_sub_policies_and_one_for_those_that_use_them(study):
+    fill(study, ("walker/plain", "bandit/hrl/plain"), 3)
+    for seed in range(3):
+        write_switching(study, "walker/plain", seed, 0.4, 0.1)
+        write_success(study, "bandit/hrl/plain", seed, (0.5, 0.6, 0.1)[seed])
+    found, rows = results.Results(study), ("walker/plain", "bandit/hrl/plain")
+    (walker,) = row_tables.sub_policies(found, rows).rows
+    assert walker[:3] == ("walker/plain", "3", "7,995,392")
+    assert walker[-2:] == ("40.0 [40.0, 40.0] %", "10.0 [10.0, 10.0] %")
+    table = row_tables.task_policies(found, rows)
+    (master,) = (dict(zip(table.header, line, strict=True)) for line in table.rows)
+    assert master["around walls"] == "-"
+    assert master["within 1 m"] == "40.0 [10.0, 60.0] %"
+    assert master["turned over"] == "7.0 [7.0, 7.0] %"
+    assert master["worst seed, within 1 m"] == "10.0 %"
+    (study.runs / "walker/plain/seed-0/transitions.json").unlink()
+    (walker,) = row_tables.sub_policies(results.Results(study), rows).rows
+    assert walker[-1] == "10.0 [10.0, 10.0] % (2)"
 
 
 def test_figures_of_which_there_is_one_are_not_drawn_under_another_ant(study, tmp_path):

@@ -39,4 +39,5 @@ def _table(lines: list[str], heading: str) -> tuple[int, int]:
 
 if __name__ == "__main__":
     path = ROOT / "README.md"
-    path.write_text(with_tables(path.read_text(), (ROOT / "report" / "REPORT.md").read_text()))
+    report = (ROOT / "report" / "REPORT.md").read_text(encoding="utf-8")
+    path.write_text(with_tables(path.read_text(encoding="utf-8"), report), encoding="utf-8")

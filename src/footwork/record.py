@@ -426,19 +426,27 @@ def source_digest() -> str:
 
 @functools.cache
 def source_commit() -> str:
-    """The commit of the package's source, if it lies in a repository and is as that commit has it; else empty."""
+    """The commit that made the package's source what it is; empty if it was changed since, or lies in no repository."""
     package = Path(footwork.__file__).parent
+    # A hook's git tells its children which repository it means: not ours.
+    environment = {name: value for name, value in os.environ.items() if name not in _GIT_PLACES}
 
     def git(*arguments: str) -> str:
+        command = ("git", "--no-optional-locks", "-C", str(package), *arguments)
         return subprocess.run(
-            ("git", "-C", str(package), *arguments), capture_output=True, text=True, timeout=10, check=True
+            command, capture_output=True, text=True, timeout=10, check=True, env=environment
         ).stdout.strip()
 
     try:
-        tracked = git("ls-files", "--error-unmatch", "__init__.py")
-        return git("rev-parse", "--short", "HEAD") if tracked and not git("status", "--porcelain", "--", ".") else ""
+        git("ls-files", "--error-unmatch", "__init__.py")
+        return (
+            "" if git("status", "--porcelain", "--", ".") else git("log", "-1", "--abbrev=7", "--format=%h", "--", ".")
+        )
     except (OSError, subprocess.SubprocessError):
         return ""
+
+
+_GIT_PLACES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
 class Progress:

@@ -370,13 +370,14 @@ CLAIMS: tuple[Claim, ...] = (
             ),
             *(
                 _greater(
-                    f"hand-overs, against {kind}, annealed",
+                    f"hand-overs, against {kind}, annealed{how}",
                     "walker/interleaved",
                     f"ablation/annealed/{kind}",
-                    "handover",
+                    metric,
                     0.05,
                     decides=False,
                 )
+                for metric, how in _HANDING_OVER
                 for kind in PAPER_REGULARISERS
             ),
             *(
@@ -389,7 +390,7 @@ CLAIMS: tuple[Claim, ...] = (
                     decides=False,
                 )
                 for kind in PAPER_REGULARISERS
-                for metric, how in (("way", ""), ("success", ", success"))
+                for metric, how in (("way", ""), *((metric, f", {words}") for metric, words in _SHORT.items()))
             ),
         ),
         everywhere=True,

@@ -240,10 +240,13 @@ ANNEALED: tuple[Experiment, ...] = tuple(
 )
 # And masters on those.
 ANNEALED_MASTERS: tuple[Experiment, ...] = tuple(
-    replace(MAIN[f"{place}/hrl/{kind}"], name=f"ablation/{place}/hrl-annealed/{kind}", sub_policies=row.name)
+    replace(
+        MAIN[row.name.replace("ablation/annealed", f"{place}/hrl")],
+        name=row.name.replace("annealed", f"{place}/hrl-annealed"),
+        sub_policies=row.name,
+    )
     for place in ("bandit", "maze")
     for row in ANNEALED
-    for kind in (row.name.rpartition("/")[2],)
 )
 
 # Rows of the light ant: what claims 7 to 12 and 14 read.

@@ -49,7 +49,9 @@ class Metric:
 
     def number(self, value: float) -> str:
         """The value as text, without."""
-        return f"{100 * value:.1f}" if self.is_share else f"{value:.4g}"
+        if self.is_share:
+            return f"{100 * value:.1f}"
+        return f"{value:.2f}" if abs(value) < 10 else f"{value:.4g}"
 
     def with_interval(self, effect: Effect, alone: bool = False) -> str:
         """The estimate with its interval, without a unit; a lone seed has no interval."""

@@ -26,7 +26,7 @@ from footwork.study.pages import Block, Bullets, Code, Heading, Picture, TableBl
 from footwork.study.plan import default_rows, plan, read_machine
 from footwork.study.report_files import RESULTS, check_place, export
 from footwork.study.results import Results, all_rows, prefixes_at_hand, seeds_in_words
-from footwork.study.row_tables import SIDE_BY_SIDE, side_by_side, sub_policies, task_policies
+from footwork.study.row_tables import side_by_side, side_by_side_caption, sub_policies, task_policies
 from footwork.train import planned_steps, steps_per_iteration
 
 
@@ -68,13 +68,16 @@ def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> lis
             )
         )
     blocks += [Heading("Claims"), _overview_table(judgements), Heading("How to read this", 3), Bullets(_reading())]
-    blocks += [Heading("Side by side"), side_by_side(results), Text(SIDE_BY_SIDE)]
+    blocks += [Heading("Side by side"), Text(side_by_side_caption(results)), side_by_side(results)]
     blocks += [Heading("The paper, in its order"), _answers_table(judgements, results)]
     blocks += [Heading("What the paper leaves open, and what we took", 3), _choices_table(results)]
     blocks += [Heading("Figures"), *[Picture(d, _facts(results)) for d in drawn]]
     blocks += [Heading("Rows"), Text(_rows_read(results))]
-    for title, table in (("Sub-policies", sub_policies), ("Masters and flat policies", task_policies)):
-        blocks += [Heading(title, 3), table(results, rows)]
+    for title, table in (
+        ("Sub-policies", sub_policies(results, rows)),
+        ("Masters and flat policies", task_policies(results, rows)),
+    ):
+        blocks += [Heading(title, 3), table] if table.rows else []
     blocks += [Heading("Each claim in each setting"), _claims_table(judgements)]
     blocks += [Heading("Every comparison"), _comparisons_table(judgements)]
     made = _made(results, rows, command)  # reads files, and so may find problems with them

@@ -7,109 +7,107 @@ from collections.abc import Sequence
 import numpy as np
 
 from footwork.study.claims import MIN_SEEDS, Setting
-from footwork.study.experiments import ANNEALED, SCHEDULES, WALKERS, find_row, is_row
+from footwork.study.experiments import ANNEALED, WALKERS, find_row, is_row
+from footwork.study.figures import count_in_words
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import TableBlock
 from footwork.study.results import Results, prefixes_at_hand
 
-_WALKING = ("speed", "handover", "idle", "upside down")
-_SETTINGS = tuple((place, schedule) for schedule in reversed(SCHEDULES) for place in ("bandit", "maze"))
+_SWITCHED = {f"idle, k = {SWITCHED_EVERY}": "idle", f"upside down, k = {SWITCHED_EVERY}": "upside down"}
+_OF_SUB_POLICIES = {"m/s": "speed", "training return": "return", "hand-overs": "handover", **_SWITCHED}
+_OF_POLICIES = {
+    "way": "way",
+    "around walls": "route",
+    "within 1 m": "success",
+    "0.5 m": "success close",
+    "turned over": "turned over",
+}
+
+_SETTINGS = {
+    "AntBandit, our reward": ("bandit", "hrl"),
+    "AntMaze, our reward": ("maze", "hrl"),
+    "AntBandit, the paper's": ("bandit", "paper"),
+    "AntMaze, the paper's": ("maze", "paper"),
+}
 _KINDS = tuple(row.name.removeprefix("walker/") for row in WALKERS)
 _ANNEALED_KINDS = tuple(row.name.rpartition("/")[2] for row in ANNEALED)
-# A line's name, its sub-policies' row, and its masters' or flat policies': PLACE is a task, the rest a setting's.
+# A line's name, the row of its sub-policies, and those of its masters or flat policies: of any task and setting.
 _LINES: tuple[tuple[str, str, str], ...] = (
-    *((kind, f"walker/{kind}", f"PLACE/{{schedule}}/{kind}") for kind in _KINDS),
+    *((kind, f"walker/{kind}", f"{{place}}/{{schedule}}/{kind}") for kind in _KINDS),
     *(
-        (f"{kind}, annealed", f"ablation/annealed/{kind}", f"ablation/PLACE/{{schedule}}-annealed/{kind}")
+        (f"{kind}, annealed", f"ablation/annealed/{kind}", f"ablation/{{place}}/{{schedule}}-annealed/{kind}")
         for kind in _ANNEALED_KINDS
     ),
-    *((f"flat policy, {kind}", "", f"PLACE/flat/{{guided}}{kind}") for kind in ("free", "penalised")),
+    *((f"flat policy, {kind}", "", f"{{place}}/flat/{{guided}}{kind}") for kind in ("free", "penalised")),
 )
 
 
 def side_by_side(results: Results) -> TableBlock:
     """What each kind of sub-policies does, and how often masters on them reach the goal; flat policies below."""
+    of_sub_policies = {"hand-overs": "handover", **_SWITCHED}
     lines = []
     for prefix in prefixes_at_hand(results):
         for name, walkers, policy in _LINES:
-            cells = [_cell(results, prefix + walkers, metric) if walkers else "" for metric in _WALKING]
-            rows = [Setting(prefix, schedule).fill(policy.replace("PLACE", place)) for place, schedule in _SETTINGS]
-            lines.append((prefix + name, *cells, *(_cell(results, row, "success") for row in rows)))
-    header = (
-        "sub-policies",
-        "m/s",
-        "hand-overs",
-        f"idle, k = {SWITCHED_EVERY}",
-        f"upside down, k = {SWITCHED_EVERY}",
-        "AntBandit, our reward",
-        "AntMaze, our reward",
-        "AntBandit, the paper's",
-        "AntMaze, the paper's",
+            cells = [_cell(results, prefix + walkers, metric) if walkers else "" for metric in of_sub_policies.values()]
+            for place, schedule in _SETTINGS.values():
+                row = Setting(prefix, schedule).fill(policy.replace("{place}", place))
+                cells.append(_cell(results, row, "success"))
+            lines.append((prefix + name, *cells))
+    shown = tuple(line for line in lines if any(cell not in ("", "-") for cell in line[1:]))
+    return TableBlock(("sub-policies", *of_sub_policies, *_SETTINGS), shown)
+
+
+def side_by_side_caption(results: Results) -> str:
+    """What the columns of :func:`side_by_side` are."""
+    named = ("walker/plain", "walker/symmetric", "bandit/hrl/plain", "maze/hrl/plain", "maze/flat/free")
+    rows = map(results.study.row, named)
+    four, one, bandit, maze, flat = (count_in_words(row.total_steps * row.runs_per_seed) for row in rows)
+    return (
+        "Shares in per cent, interquartile means over seeds with 95 % intervals (one without width says only that the "
+        f"seeds agree); (3): of 3 seeds instead of {MIN_SEEDS}. Hand-overs: orthogonal ones that succeed. Switched at "
+        f"random every k = {SWITCHED_EVERY} control steps: options that hardly move the ant (idle), ants upside down in the "
+        "end; episodes in which a master on these sub-policies, or a flat policy, comes within 1 m of the goal "
+        "(both settings); free: without stability penalties. Control steps of training: four sub-policies "
+        f"{four}, a symmetric one {one}, masters {bandit} on AntBandit and {maze} on AntMaze besides, flat policies "
+        f"{flat}."
     )
-    return TableBlock(header, tuple(line for line in lines if any(cell not in ("", "-") for cell in line[1:])))
-
-
-SIDE_BY_SIDE = (
-    "Interquartile means over seeds with 95 % intervals, shares in per cent; in brackets behind, the number of seeds "
-    f"where it is not {MIN_SEEDS}. Speed of each sub-policy by itself; orthogonal hand-overs that succeed; switched at "
-    f"random every {SWITCHED_EVERY} control steps, options that hardly move the ant, and ants upside down in the end; "
-    "episodes in which a master on these sub-policies, or a flat policy, comes within 1 m of the goal. How long each "
-    "was trained stands under Rows."
-)
-
-
-def _cell(results: Results, row: str, metric: str) -> str:
-    """A number for a table that names units elsewhere; how many seeds it has, unless as many as claims ask for."""
-    if not is_row(row):
-        return ""
-    effect, seeds = results.middle(row, metric), len(results.scores(row, metric))
-    if effect is None:
-        return "-"
-    return METRICS[metric].with_interval(effect, alone=seeds == 1) + ("" if seeds == MIN_SEEDS else f" ({seeds})")
 
 
 def sub_policies(results: Results, rows: Sequence[str]) -> TableBlock:
     """Every row of sub-policies among some, with all its numbers."""
-    columns = {
-        "m/s": "speed",
-        "training return": "return",
-        "hand-overs": "handover",
-        f"idle, k = {SWITCHED_EVERY}": "idle",
-        f"upside down, k = {SWITCHED_EVERY}": "upside down",
-    }
-    return _table(results, [row for row in rows if find_row(row).is_walker], columns)
+    return _table(results, [row for row in rows if find_row(row).is_walker], _OF_SUB_POLICIES)
 
 
 def task_policies(results: Results, rows: Sequence[str]) -> TableBlock:
     """Every row of masters and flat policies among some, with all its numbers."""
-    columns = {
-        "way": "way",
-        "around walls": "route",
-        "within 1 m": "success",
-        "0.5 m": "success close",
-        "turned over": "turned over",
-    }
-    return _table(results, [row for row in rows if not find_row(row).is_walker], columns)
+    return _table(results, [row for row in rows if not find_row(row).is_walker], _OF_POLICIES, worst="success")
 
 
-def _table(results: Results, rows: Sequence[str], columns: dict[str, str]) -> TableBlock:
+def _table(results: Results, rows: Sequence[str], columns: dict[str, str], worst: str | None = None) -> TableBlock:
     lines = []
     for row in rows:
-        samples = results.samples(row)
-        seconds = results.training_seconds(row)
+        samples, seconds = results.samples(row), results.training_seconds(row)
         steps = sorted({sample.control_steps for sample in samples})
         taken = " to ".join(f"{n:,}" for n in dict.fromkeys((steps[0], steps[-1])))
         minutes = f"{np.mean(seconds) / 60:.1f}" if seconds else "-"
-        cells = (_shown(results, row, metric) for metric in columns.values())
+        cells = [_cell(results, row, metric, len(samples), with_unit=True) for metric in columns.values()]
+        if worst is not None:
+            scores = results.scores(row, worst)
+            cells.append(METRICS[worst].show(scores.min()) if len(scores) else "-")
         lines.append((row, str(len(samples)), taken, minutes, *cells))
-    return TableBlock(("row", "seeds", "control steps", "minutes", *columns), tuple(lines))
+    more = () if worst is None else (f"worst seed, {next(name for name in columns if columns[name] == worst)}",)
+    return TableBlock(("row", "seeds", "control steps", "minutes", *columns, *more), tuple(lines))
 
 
-def _shown(results: Results, row: str, metric: str) -> str:
-    effect, kind = results.middle(row, metric), METRICS[metric]
+def _cell(results: Results, row: str, metric: str, usual: int = MIN_SEEDS, with_unit: bool = False) -> str:
+    """A row's number, and how many seeds have it where that is not the usual number; empty if there is no such row."""
+    if not is_row(row):
+        return ""
+    effect, seeds, kind = results.middle(row, metric), len(results.scores(row, metric)), METRICS[metric]
     if effect is None:
         return "-"
-    return kind.with_interval(effect, alone=len(results.samples(row)) == 1) + (" %" if kind.is_share else "")
+    unit = " %" if with_unit and kind.is_share else ""
+    return kind.with_interval(effect, alone=seeds == 1) + unit + ("" if seeds == usual else f" ({seeds})")
 
 
-__all__ = ["SIDE_BY_SIDE", "side_by_side", "sub_policies", "task_policies"]
+__all__ = ["side_by_side", "side_by_side_caption", "sub_policies", "task_policies"]

@@ -151,6 +151,49 @@ def test_spread_is_within_strata():
     assert statistics.spread(np.array([[1.0], [3], [5]])) == pytest.approx(2)
 
 
+PAIRS = hnp.arrays(np.float64, st.tuples(st.integers(3, 12), st.just(2)), elements=st.integers(0, 6).map(float))
+
+
+@given(PAIRS)
+def test_rank_correlation_of_one_group_is_spearmans(pairs):
+    if any(len(set(side)) == 1 for side in pairs.T):
+        with pytest.raises(ValueError, match="does not vary"):
+            statistics.rank_correlation([pairs], np.random.default_rng(0), draws=10)
+        return
+    found = statistics.rank_correlation([pairs], np.random.default_rng(0), draws=50)
+    assert found.estimate == pytest.approx(scipy.stats.spearmanr(*pairs.T).statistic, abs=1e-9)
+    assert -1 - 1e-9 <= found.low <= found.high <= 1 + 1e-9
+
+
+def test_what_sets_groups_apart_is_no_rank_correlation():
+    """Groups on a falling line, seeds of each on a rising one: the kinds would say -, the seeds say +."""
+    key = np.random.default_rng(0)
+    groups = [np.column_stack([np.arange(8) + 100 * g, np.arange(8) - 100 * g]).astype(float) for g in range(3)]
+    assert scipy.stats.spearmanr(*np.concatenate(groups).T).statistic < -0.5
+    assert statistics.rank_correlation(groups, key, draws=50) == pytest.approx((1, 1, 1))
+    stretched = [np.exp(group / 100) for group in groups]
+    assert statistics.rank_correlation(stretched, key, draws=50).estimate == pytest.approx(1)
+
+
+def test_intervals_of_a_rank_correlation_cover_as_often_as_they_say():
+    key, hits = np.random.default_rng(1), 0
+    for _ in range(200):
+        own = key.normal(0, 1, (4, 10, 2))
+        pairs = np.stack([own[..., 0], 0.7 * own[..., 0] + np.sqrt(0.51) * own[..., 1]], axis=-1)
+        effect = statistics.rank_correlation(list(pairs), key, draws=200)
+        hits += effect.low <= 6 / np.pi * np.arcsin(0.35) <= effect.high
+    assert 0.90 <= hits / 200 <= 0.99
+
+
+@pytest.mark.parametrize(
+    ("groups", "message"),
+    [([], "groups of pairs"), ([[1.0, 2.0]], "groups of pairs"), ([[[1.0, np.nan], [2.0, 3.0]]], "finite")],
+)
+def test_pairs_that_say_nothing_are_refused(groups, message):
+    with pytest.raises(ValueError, match=message):
+        statistics.rank_correlation(groups, np.random.default_rng(0))
+
+
 def test_profiles_and_bands():
     np.testing.assert_array_equal(
         statistics.performance_profile([0.1, 0.5, 0.9, 0.9], [0.0, 0.5, 0.89, 1]), [1, 0.5, 0.5, 0]

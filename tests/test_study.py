@@ -19,6 +19,7 @@ from footwork.record import RunDir, RunError, read_metrics
 from footwork.statistics import Effect, iqm
 from footwork.study import (
     answers,
+    association,
     claims,
     judging,
     measure,
@@ -863,6 +864,30 @@ def test_figures_of_which_there_is_one_are_not_drawn_under_another_ant(study, tm
     fill(study, ("light/walker/plain", "light/maze/hrl/interleaved"), 1)
     drawn = draw_figures(results.Results(study), find_figures(["12", "13", "14", "20"]), tmp_path, "light/")
     assert [one.figure.name for one in drawn] == ["12-switching"]
+
+
+def test_masters_are_set_beside_their_own_sub_policies(study):
+    """By seed, whichever seeds are there; and a kind of which nothing can be said leaves the others alone."""
+    bandit = association.ASSOCIATIONS[0]
+    for seed, quality in enumerate((0.2, 0.5, 0.8)):
+        fake_run(study, "walker/plain", seed, quality)
+        if seed:
+            fake_run(study, "bandit/hrl/plain", seed, 1 - quality)
+    found = results.Results(study)
+    pairs = association.seed_pairs(found, bandit)["plain"]
+    assert pairs[:, 1] == pytest.approx([found.scores_by_seed("bandit/hrl/plain", "success")[seed] for seed in (1, 2)])
+    assert pairs[0, 0] < pairs[1, 0]
+    assert association.strength(found, bandit) is None  # two seeds say nothing
+    fake_run(study, "bandit/hrl/plain", 0, 0.9)
+    fill(study, ("bandit/hrl/interleaved",), 3)  # without its sub-policies
+    found = results.Results(study)
+    assert list(association.seed_pairs(found, bandit)) == ["plain"]
+    assert association.strength(found, bandit).estimate == pytest.approx(-1)
+    assert association.strength(found, bandit, "light/") is None
+    answer = next(answer for answer in answers.ANSWERS if answer.associations)
+    text = answers.said(answer, [], found)
+    assert "AntBandit, our reward: -1.00 [-1.00, " in text
+    assert "AntMaze, our reward: no runs that say it" in text
 
 
 def test_panels_say_how_many_seeds(study):

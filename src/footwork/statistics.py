@@ -149,6 +149,42 @@ def probability_of_improvement(one: npt.ArrayLike, other: npt.ArrayLike) -> floa
     return float(np.mean((pairs > 0) + 0.5 * (pairs == 0)))
 
 
+def rank_correlation(groups: Sequence[npt.ArrayLike], generator: np.random.Generator, draws: int = DRAWS) -> Effect:
+    """Spearman's correlation of pairs [S, 2] within groups, with its stratified-bootstrap interval.
+
+    Ranks are taken within each group, ties sharing theirs, and counted from the group's mean, so that what sets
+    groups apart adds nothing; with one group it is Spearman's rho. Each group's pairs are resampled on their own. A
+    resample in which nothing varies counts as no correlation.
+
+    Raises:
+        ValueError: there are no pairs, they are not finite, or one side does not vary within any group.
+    """
+    pairs = [np.asarray(group, np.float64) for group in groups]
+    if not pairs or any(group.ndim != 2 or group.shape[1] != 2 or not len(group) for group in pairs):
+        raise ValueError(f"groups of pairs [seeds, 2], got shapes {[group.shape for group in pairs]}")
+    if not all(np.isfinite(group).all() for group in pairs):
+        raise ValueError("pairs must be finite")
+    here = _pooled_correlation([group[None] for group in pairs])[0]
+    if np.isnan(here):
+        raise ValueError("one side does not vary within any group")
+    drawn = _pooled_correlation([group[draw_seeds(len(group), draws, generator)] for group in pairs])
+    low, high = percentile_interval(np.nan_to_num(drawn))
+    return Effect(float(here), float(low), float(high))
+
+
+def _pooled_correlation(groups: Sequence[Floats]) -> Floats:
+    """Of pairs [draws, S, 2] of each group: their centred ranks' correlation [draws]; NaN where nothing varies."""
+    centred = []
+    for group in groups:
+        below = (group[:, None] < group[:, :, None]) + 0.5 * (group[:, None] == group[:, :, None])  # [draws, S, S, 2]
+        ranks = below.sum(axis=2)
+        centred.append(ranks - ranks.mean(axis=1, keepdims=True))
+    ranks = np.concatenate(centred, axis=1)
+    both, one, other = (np.sum(ranks[..., i] * ranks[..., j], axis=1) for i, j in ((0, 1), (0, 0), (1, 1)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(both / np.sqrt(one * other))
+
+
 def performance_profile(scores: npt.ArrayLike, thresholds: npt.ArrayLike) -> Floats:
     """Share of runs that score above each threshold (rliable's score distribution)."""
     values = as_scores(scores).reshape(-1)
@@ -239,6 +275,7 @@ __all__ = [
     "performance_profile",
     "probability_of_improvement",
     "profile_band",
+    "rank_correlation",
     "rate_over_seeds",
     "spread",
     "wilson",

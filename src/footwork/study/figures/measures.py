@@ -8,8 +8,19 @@ import numpy as np
 
 from footwork.arena import DIRECTIONS
 from footwork.statistics import Effect, Floats, contrast, generator_for, iqm, profile_band
+from footwork.study.association import ASSOCIATIONS, OF_MASTERS, OF_SUB_POLICIES, seed_pairs, strength
 from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, GRIDS, Grid
-from footwork.study.figures.style import Look, empty, interval_marks, label_of, legend_below, look_of, panels, seeds_of
+from footwork.study.figures.style import (
+    LOOKS,
+    Look,
+    empty,
+    interval_marks,
+    label_of,
+    legend_below,
+    look_of,
+    panels,
+    seeds_of,
+)
 from footwork.study.measure import TRANSITIONS
 from footwork.study.metrics import METRICS
 from footwork.study.results import Results, seeds_in_words
@@ -212,6 +223,26 @@ def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) 
     if METRICS[metric].is_share:
         ax.set_xlim(right=1.03)
     ax.set_xlabel(_wrapped(METRICS[metric].words, 30), fontsize=7)
+
+
+def masters_by_handovers(results: Results, rows: tuple[str, ...]) -> Any:
+    """A point per seed: how well its sub-policies hand over, and how often the master on them arrives."""
+    prefix = rows[0].partition("walker/")[0]
+    figure, axes = panels(1, len(ASSOCIATIONS), 3.0, share_y=True)
+    for ax, association in zip(axes[0], ASSOCIATIONS, strict=True):
+        found = seed_pairs(results, association, prefix)
+        for kind, pairs in found.items():
+            look = LOOKS[kind]
+            ax.plot(*pairs.T, ls="", marker=look.mark, color=look.colour, ms=4.5, alpha=0.75, mew=0, label=kind)
+        effect = strength(results, association, prefix)
+        rho = f"ρ = {effect.estimate:.2f} [{effect.low:.2f}, {effect.high:.2f}]" if effect else "ρ: -"
+        ax.set_title(f"{association.words}\n{rho}" if found else association.words)
+        ax.set_xlabel(_wrapped(METRICS[OF_SUB_POLICIES].words))
+        if not found:
+            empty(ax, "no finished runs yet")
+    axes[0, 0].set_ylabel(_wrapped(METRICS[OF_MASTERS].words))
+    legend_below(figure, list(axes[0]), columns=4)
+    return figure
 
 
 def profiles(results: Results, rows: tuple[str, ...]) -> Any:

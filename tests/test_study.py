@@ -30,10 +30,11 @@ from footwork.study import (
     row_tables,
     training_curves,
 )
-from footwork.study.experiments import EXPERIMENTS, GRIDS, GRIDS_BY_NAME, MAIN, find_row, is_row, match_rows
+from footwork.study.experiments import EXPERIMENTS, FLAT_GRIDS, GRIDS, GRIDS_BY_NAME, MAIN, find_row, is_row, match_rows
 from footwork.study.figures import FIGURES, draw_figures, find_figures, style
 from footwork.study.metrics import METRICS
 from footwork.study.plan import FULL, QUICK, Study
+from footwork.train import planned_steps, steps_per_iteration
 
 WALKERS = ("walker/plain", "walker/random-start", "walker/random-repeated", "walker/appropriate-bias")
 KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias")
@@ -65,6 +66,8 @@ def test_grids_are_rows_that_differ_in_one_field():
     assert find_row("ablation/random-start/t/25").regulariser.steps == 25
     bonus = GRIDS_BY_NAME["ablation/bandit/flat-free-bonus"].points()
     assert bonus == {0.0: "ablation/bandit/flat-free-bonus/0.0", 0.02: "bandit/flat/free"}
+    annealed = find_row("ablation/bandit/flat-free-annealing/4882")
+    assert annealed.ppo.anneal_updates == planned_steps(annealed) // steps_per_iteration(annealed)
 
 
 def test_rows_of_another_ant_stand_on_rows_of_that_ant():
@@ -604,17 +607,18 @@ def test_every_comparison_has_its_rows_in_some_setting():
             assert any(all(is_row(setting.fill(row)) for row in c.rows) for setting in settings), c.words
 
 
-def test_flat_policies_without_a_bonus_are_shown_in_the_papers_setting_only(study):
+def test_flat_policies_made_otherwise_are_shown_in_the_papers_setting_only(study):
     fill(study, ("bandit/paper/appropriate-bias",), 2, quality=0.9)
     fill(study, ("ablation/bandit/flat-free-bonus/0.0",), 2, quality=0.3)
     found = {
-        setting: [f for f in judgement.findings if "without an entropy bonus" in f.contrast.words]
+        setting: [f for f in judgement.findings if "ablation" in f.rows[1]]
         for setting, judgement in verdicts(study, 1).items()
     }
     paper, ours = found["mujoco, heavy ant, the paper's reward and schedule"], [*found.values()]
-    assert [f.rows[1] for f in paper] == [f"ablation/bandit/flat-{k}-bonus/0.0" for k in ("penalised", "free")]
-    assert paper[1].so_far == "holds"
-    assert [len(findings) for findings in ours] == [2, 0]
+    assert [f.rows[1].rpartition("/")[0] for f in paper] == list(FLAT_GRIDS)
+    assert paper[0].contrast.words == "against flat, free, without an entropy bonus"
+    assert paper[0].so_far == "holds"
+    assert [len(findings) for findings in ours] == [4, 0]
 
 
 def test_verdicts_name_engine_and_ant_and_one_failing_comparison_is_enough(study):

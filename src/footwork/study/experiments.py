@@ -220,10 +220,26 @@ GRIDS: tuple[Grid, ...] = (
     Grid("ablation/maze/B-as-size", "maze/paper/interleaved", "ppo.minibatch_size", (32,), "B as a size"),
     Grid("ablation/maze/potential", "maze/hrl/interleaved", "task.potential", ("straight",), "potential"),
     Grid("ablation/maze/potential-paper", "maze/paper/interleaved", "task.potential", ("geodesic",), "potential"),
-    # The bonus is ours too, and only penalties hold a deviation back: do flat policies fail because of the bonus?
+    # The bonus and the cap are ours too, and only penalties hold a deviation back; and Table 1's step stays constant.
+    # Do flat policies fail because of any of these?
     Grid("ablation/bandit/flat-free-bonus", "bandit/flat/free", "ppo.ent_coef", (0.0,), "entropy bonus"),
+    Grid("ablation/bandit/flat-free-deviation", "bandit/flat/free", "ppo.max_log_std", (0.5,), "cap of log-deviation"),
+    Grid(
+        "ablation/bandit/flat-free-annealing",
+        "bandit/flat/free",
+        "ppo.anneal_updates",
+        (_annealed(FLAT_STEPS).anneal_updates,),
+        "updates in which bonus and step fall",
+    ),
     Grid("ablation/bandit/flat-penalised-bonus", "bandit/flat/penalised", "ppo.ent_coef", (0.0,), "entropy bonus"),
 )
+# Those of them that vary a flat policy, and in what.
+FLAT_GRIDS: dict[str, str] = {
+    "ablation/bandit/flat-free-bonus": "without an entropy bonus",
+    "ablation/bandit/flat-free-deviation": "its deviation capped",
+    "ablation/bandit/flat-free-annealing": "annealed",
+    "ablation/bandit/flat-penalised-bonus": "without an entropy bonus",
+}
 GRIDS_BY_NAME: dict[str, Grid] = {grid.name: grid for grid in GRIDS}
 
 # What interleaved rows have besides their regulariser: annealing. The paper's rows with it, to tell the two apart.

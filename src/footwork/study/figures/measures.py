@@ -9,7 +9,7 @@ import numpy as np
 from footwork.arena import DIRECTIONS
 from footwork.statistics import Effect, Floats, contrast, generator_for, iqm, profile_band
 from footwork.study.association import ASSOCIATIONS, OF_MASTERS, OF_SUB_POLICIES, seed_pairs, strength
-from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, GRIDS, Grid
+from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, FLAT_GRIDS, GRIDS, Grid
 from footwork.study.figures.style import (
     LOOKS,
     Look,
@@ -152,11 +152,11 @@ def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
-    """B, the potential, the entropy bonus, annealing, the ant: rows side by side, in three metrics."""
+    """B, the potential, how flat policies learn, annealing, the ant: rows side by side, in three metrics."""
     tasks = [row for grid in _COMPARED_GRIDS if "walker" not in grid.base for row in grid.points().values()]
     walkers = [row for grid in _COMPARED_GRIDS if "walker" in grid.base for row in grid.points().values()]
     lines = (
-        ("B, the potential and the entropy bonus: masters, flat policies", tasks, ("way", "route", "success")),
+        ("B, the potential, how flat policies learn: masters, flat policies", tasks, ("way", "route", "success")),
         (
             "B, annealing and the ant: sub-policies",
             [*walkers, *_ANNEALED, *(row for row in _OF_ANTS if "walker/" in row)],
@@ -178,7 +178,7 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
 
 
 _COMPARED_GRIDS = tuple(
-    grid for grid in GRIDS if grid.field in ("ppo.minibatch_size", "task.potential", "ppo.ent_coef")
+    grid for grid in GRIDS if grid.field in ("ppo.minibatch_size", "task.potential") or grid.name in FLAT_GRIDS
 )
 _OF_ANTS = tuple(
     f"{ant}{row}"

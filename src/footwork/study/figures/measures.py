@@ -228,8 +228,9 @@ def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) 
 def masters_by_handovers(results: Results, rows: tuple[str, ...]) -> Any:
     """A point per seed: how well its sub-policies hand over, and how often the master on them arrives."""
     prefix = rows[0].partition("walker/")[0]
-    figure, axes = panels(1, len(ASSOCIATIONS), 3.0, share_y=True)
-    for ax, association in zip(axes[0], ASSOCIATIONS, strict=True):
+    there = [one for one in ASSOCIATIONS if any(row.startswith(f"{prefix}{one.place}/") for row in rows)]
+    figure, axes = panels(1, len(there), 3.0, share_y=True)
+    for ax, association in zip(axes[0], there, strict=True):
         found = seed_pairs(results, association, prefix)
         for kind, pairs in found.items():
             look = LOOKS[kind]

@@ -597,7 +597,10 @@ def test_shown_comparisons_do_not_decide_and_rows_of_ablations_do_not_ask_for_te
     assert {"walker/plain", "walker/interleaved"} <= set(claims.rows_read())
     fill(study, ("light/walker/plain",), 2)
     light = verdicts(study, 14)["mujoco, light ant, our reward, our masters' schedule"]
-    assert not any("annealed" in finding.contrast.words for finding in light.findings)
+    annealed = {row for f in light.findings if "annealed" in f.contrast.words for row in f.rows if "annealed" in row}
+    assert {f"light/ablation/maze/hrl-annealed/{kind}" for kind in claims.PAPER_REGULARISERS} < annealed
+    assert find_row("light/ablation/annealed/appropriate-bias").regulariser.partners == "light/ablation/annealed/plain"
+    assert find_row("light/ablation/maze/hrl-annealed/plain").needs == "light/ablation/annealed/plain"
 
 
 def test_every_comparison_has_its_rows_in_some_setting():

@@ -9,7 +9,7 @@ import numpy as np
 from footwork.arena import DIRECTIONS
 from footwork.statistics import Effect, Floats, contrast, generator_for, iqm, profile_band
 from footwork.study.association import ASSOCIATIONS, OF_MASTERS, OF_SUB_POLICIES, seed_pairs, strength
-from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, FLAT_GRIDS, GRIDS, Grid
+from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, FLAT_GRIDS, GRIDS, Grid, find_row
 from footwork.study.figures.style import (
     LOOKS,
     Look,
@@ -159,12 +159,12 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
         ("B, the potential, how flat policies learn: masters, flat policies", tasks, ("way", "route", "success")),
         (
             "B, annealing and the ant: sub-policies",
-            [*walkers, *_ANNEALED, *(row for row in _OF_ANTS if "walker/" in row)],
+            [*walkers, *_ANNEALED, *(row for row in _OF_ANTS if find_row(row).is_walker)],
             ("handover", "moving", "speed"),
         ),
         (
             "annealing and the ant: masters",
-            [*_ANNEALED_MASTERS, *(row for row in _OF_ANTS if "walker/" not in row)],
+            [*_ANNEALED_MASTERS, *(row for row in _OF_ANTS if not find_row(row).is_walker)],
             ("way", "route", "success"),
         ),
     )
@@ -182,7 +182,8 @@ _COMPARED_GRIDS = tuple(
 )
 _OF_ANTS = tuple(
     f"{ant}{row}"
-    for row in ("walker/plain", "walker/interleaved", "maze/hrl/plain", "maze/hrl/interleaved")
+    for place, annealed in (("walker", "ablation/annealed"), ("maze/hrl", "ablation/maze/hrl-annealed"))
+    for row in (f"{place}/plain", f"{annealed}/plain", f"{place}/interleaved")
     for ant in ("", "light/")
 )
 _ANNEALED = tuple(row for one in ANNEALED for row in (one.name.replace("ablation/annealed", "walker"), one.name))
@@ -209,7 +210,7 @@ def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) 
     """A metric of several rows, one line each; names, and numbers of seeds, stand left of the first panel."""
     names = []
     for y, row in enumerate(rows):
-        names.append(f"{row.removeprefix('ablation/')} ({len(results.scores(row, metric))})")
+        names.append(f"{row.replace('ablation/', '')} ({len(results.scores(row, metric))})")
         e = results.middle(row, metric)
         if e is not None:
             ax.plot([e.low, e.high], [y, y], color="#0072B2", lw=2, solid_capstyle="butt")

@@ -673,6 +673,19 @@ def test_a_difference_that_had_no_room_is_said_to_have_had_none(study):
     assert metrics == {"handover", "moving"}
 
 
+def test_where_all_stand_at_the_wall_it_is_said_that_nothing_more_was_possible(study):
+    """On AntMaze the straight line ends 1.59 m from the start, after 19.9 % of the way."""
+    for kind, way in (("appropriate-bias", 0.16), ("plain", 0.17)):
+        fill(study, (f"maze/paper/{kind}",), 10)
+        for seed in range(10):
+            write_success(study, f"maze/paper/{kind}", seed, 0.0)
+            exactly(study.runs / f"maze/paper/{kind}/seed-{seed}", way)
+    why = verdicts(study, 8)["mujoco, heavy ant, the paper's reward and schedule"].why
+    assert "plain, no more than 2.9 points were possible without getting past the wall, which nobody did" in why
+    write_success(study, "maze/paper/plain", 3, 0.5)  # somebody did
+    assert "possible" not in verdicts(study, 8)["mujoco, heavy ant, the paper's reward and schedule"].why
+
+
 def exactly(path, good):
     """A fake run's way, with nothing by chance."""
     content = json.loads((path / "evaluation.json").read_text())
@@ -806,7 +819,7 @@ def write_switching(study, row, seed, idle, upside_down):
 def write_success(study, row, seed, success):
     path = study.runs / row / f"seed-{seed}" / "evaluation.json"
     content = json.loads(path.read_text())
-    content["by_seed"][0]["success"] |= {"1.0": success}
+    content["by_seed"][0]["success"] |= {"1.0": success, "5.0": success}
     content["by_seed"][0] |= {"flip_rate": 0.07}
     write(path, content)
 
@@ -844,7 +857,10 @@ def test_kinds_of_sub_policies_stand_side_by_side_with_their_masters(study):
     assert lines["plain, annealed"] == ["60.0 [60.0, 60.0]", "90.0 [90.0, 90.0]", "-", "12.5 [12.5, 12.5] (2)", "", ""]
     assert lines["flat policy, free"] == ["", "", "-", "75.0 [75.0, 75.0] (3)", "25.0 [25.0, 25.0]", "-"]
     assert lines["light/plain"][:2] == ["0.0 [0.0, 0.0] (3)", "20.0 [20.0, 20.0] (3)"]
-    assert "four sub-policies 8 M, a symmetric one 4 M" in row_tables.side_by_side_caption(found)
+    assert (
+        "four sub-policies 8 M (those of appropriate bias stand on as many of plain ones), a symmetric one 4 M"
+        in row_tables.side_by_side_caption(found)
+    )
 
 
 def test_rows_have_a_table_for_sub_policies_and_one_for_those_that_use_them(study):

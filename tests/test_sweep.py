@@ -284,6 +284,12 @@ def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
     beside = find_needed(small, tmp_path)
     assert beside.seeds == (1,)
     assert (beside.params["actor"]["output"]["bias"] == 0.25).all()
+    # a master on anything else is named
+    assert not any("stands on" in problem for problem in results.problems)
+    other = untrained("walker/symmetric", (1,))
+    checkpoint.save(master.path / NEEDED, other.params, policy_meta(other.experiment, (1,), 0))
+    export(results, tmp_path / "out/other")
+    assert f"{master.path} stands on other policies than those of {run.path}" in results.problems
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="ray is installed")

@@ -220,8 +220,9 @@ ANSWERS: tuple[Answer, ...] = (
         figures=(5, 6, 19),
         shows=_grid("way", *FLAT_GRIDS),
         built="flat policies see what masters see and take 10 M control steps; a master takes 0.5 or 2 M on "
-        "sub-policies of 4 to 8 M. With the masters' reward (flat/guided-...) they are shown too, and without the "
-        "entropy bonus, which is ours, with less noise (its cap is ours too), and annealed as interleaved rows are",
+        "sub-policies of 4 M (symmetric), 8, or 16 (appropriate bias, whose partners are plain). With the masters' "
+        "reward (flat/guided-...) they are shown too, and without the entropy bonus, which is ours, with less noise "
+        "(its cap is ours too), and annealed as interleaved rows are",
     ),
     Answer(
         "8, 9",
@@ -310,7 +311,7 @@ def choices(study: Study) -> tuple[Choice, ...]:
         ),
         Choice(
             "PPO beside Table 1",
-            f"entropy bonus {table_1.ent_coef} (without it half of the walkers never leave their stand), advantages "
+            f"entropy bonus {table_1.ent_coef} (without it some walkers never leave their stand), advantages "
             f"normalised per update, Adam's epsilon {table_1.adam_eps:g}, log-deviation {table_1.initial_log_std:g} at "
             "first; no schedule of the learning rate, no gradient clipping",
         ),

@@ -140,6 +140,15 @@ def _beats_flat(place: str) -> tuple[Contrast, ...]:
             _way("against flat, penalised", master, f"{place}/flat/{{guided}}penalised"),
             _way("against flat, free", master, f"{place}/flat/{{guided}}free"),
         )
+    ) + tuple(
+        # Appropriate bias took twice the experience of a flat policy, its partners' included; plain ones took less.
+        _way(
+            f"on plain sub-policies, against flat, {kind}",
+            f"{place}/{{schedule}}/plain",
+            f"{place}/flat/{{guided}}{kind}",
+            decides=False,
+        )
+        for kind in ("penalised", "free")
     )
 
 

@@ -48,7 +48,7 @@ ANT_MAZE = Task(
 
 WALKER_STEPS = 2_000_000  # control steps per direction; not in the paper
 SYMMETRIC_STEPS = 2 * WALKER_STEPS  # of one policy, in four directions: half of what four take
-FLAT_STEPS = 10_000_000  # as many as four sub-policies and a master together
+FLAT_STEPS = 10_000_000  # as many as four sub-policies and a master on AntMaze together (not counting partners)
 
 # The master makes few decisions, and each is worth the sum of k rewards: more rows, a larger step, smaller numbers.
 MASTER_PPO = replace(PAPER, num_envs=64, num_steps=4, num_minibatches=8, learning_rate=1e-3, reward_scale=0.02)

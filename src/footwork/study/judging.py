@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,7 @@ from footwork.statistics import (
 )
 from footwork.study.claims import CLAIMS, Claim, Contrast, Rule, Setting, Verdict, settings_of
 from footwork.study.experiments import SCHEDULES, find_row, in_braces, is_row
+from footwork.study.measure import straight_line_stop
 from footwork.study.metrics import METRICS
 from footwork.study.results import Results, prefixes_at_hand, seeds_in_words
 
@@ -37,6 +39,7 @@ class Finding:
     verdict: Verdict
     so_far: Verdict  # what the rule says if the number of seeds is not asked for
     room: float | None = None  # the most that a difference of shares could be: what the other row leaves
+    at_wall: bool = False  # nobody on either side got past where the straight line meets the wall: room ends there
 
 
 @dataclass(frozen=True)
@@ -85,10 +88,20 @@ def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> F
         return Finding(what, rows, seeds, None, None, "undecided", "undecided")
     so_far: Verdict = decide(what.rule, what.bound, effect) if min(seeds) > 1 else "undecided"
     verdict = so_far if min(seeds) >= claim.min_seeds else "undecided"
-    room = None
+    room, wall = None, None
     if METRICS[what.metric].is_share and what.rule == "greater" and what.weights == (1, -1):
-        room = 1.0 - float(overall_iqm(as_scores(scores[1])))
-    return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far, room)
+        wall = _way_to_wall(results, what, rows)
+        room = (1.0 if wall is None else wall) - float(overall_iqm(as_scores(scores[1])))
+    return Finding(what, rows, seeds, effect, _probability(what, scores), verdict, so_far, room, wall is not None)
+
+
+def _way_to_wall(results: Results, what: Contrast, rows: Sequence[str]) -> float | None:
+    """The share of the way at which the straight line meets a wall, if no episode of these rows got past it."""
+    arena = find_row(rows[0]).task.arena
+    stop = straight_line_stop(arena) if what.metric == "way" else None
+    if stop is None or any(results.scores(row, "success far").any() for row in rows):
+        return None
+    return 1.0 - math.dist(stop, arena.goals[0]) / math.dist(arena.start, arena.goals[0])
 
 
 def _effect(
@@ -177,23 +190,26 @@ def _why(claim: Claim, deciding: list[Finding], verdict: Verdict) -> str:
         turned = [f.contrast.words for f in decisive if is_reversed(f)]
         said += [f"the other way round: {', '.join(turned)}"] if turned else []
         said += [f"no runs of {missing}"] if missing else []
-        return "; ".join([*said, *_no_room(deciding)])
+        return "; ".join([*said, *_without_room(deciding)])
     if missing:
         return f"no runs of {missing}"
     fewest = min(min(f.seeds) for f in deciding)
     if fewest < claim.min_seeds:
         so_far = _overall([f.so_far for f in deciding])
         return f"{seeds_in_words(fewest)}, {claim.min_seeds} are asked for; so far: {so_far}"
-    return "; ".join(["the interval allows both", *_no_room(deciding)])
+    return "; ".join(["the interval allows both", *_without_room(deciding)])
 
 
-def _no_room(deciding: list[Finding]) -> list[str]:
-    """Comparisons in which the other row leaves less than the smallest difference that matters."""
-    return [
-        f"{f.contrast.words}, no more than {100 * f.room:.1f} points were possible"
-        for f in deciding
-        if f.room is not None and f.room < f.contrast.bound
-    ]
+def _without_room(deciding: list[Finding]) -> list[str]:
+    return [f"{f.contrast.words}, {said}" for f in deciding if (said := no_room(f))]
+
+
+def no_room(finding: Finding) -> str:
+    """What is said of a comparison in which the other row leaves less than the smallest difference that matters."""
+    if finding.room is None or finding.room >= finding.contrast.bound:
+        return ""
+    short_of = " without getting past the wall, which nobody did" if finding.at_wall else ""
+    return f"no more than {100 * max(finding.room, 0.0):.1f} points were possible{short_of}"
 
 
 def is_reversed(finding: Finding) -> bool:
@@ -232,6 +248,7 @@ __all__ = [
     "decide",
     "is_reversed",
     "judge_all",
+    "no_room",
     "show_bound",
     "show_chance",
     "show_effect",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from footwork.arena import DIRECTIONS, Arena, DistanceField, Point, geodesic_field
+from footwork.evaluate import IDLE_SPEED
 from footwork.statistics import Effect, Floats
 from footwork.study.measure import EVALUATION, TRANSITIONS, straight_line_stop
 from footwork.study.training_curves import mean_between
@@ -155,7 +156,7 @@ def _switched(name: str, results: Results, sample: Sample) -> float | None:
 
 
 def _moving(results: Results, sample: Sample) -> float | None:
-    """Options of random switching in which the ant moves on along its direction at all, 0.2 m/s or more."""
+    """Options of random switching in which the ant gets on along its direction at all."""
     idle = _switched("idle", results, sample)
     return None if idle is None else 1.0 - idle
 
@@ -171,6 +172,7 @@ def _transitions(results: Results, sample: Sample) -> float | None:
 METRICS: dict[str, Metric] = {
     "way": Metric("share of the straight-line way to the goal", partial(_evaluated, "way")),
     "success": Metric("episodes that come within 1 m of the goal", partial(_success, 1.0)),
+    "success far": Metric("episodes that come within 5 m of the goal", partial(_success, 5.0)),
     "success close": Metric("episodes that come within 0.5 m of the goal", partial(_success, 0.5)),
     "route": Metric("share of the shortest way around the walls", _route),
     "stuck": Metric("episodes that end where the straight line meets the wall", partial(_evaluated, "stuck")),
@@ -193,9 +195,14 @@ METRICS: dict[str, Metric] = {
         "training return's deviation from one hundredth of training to the next", _fluctuation, _RETURN
     ),
     "handover": Metric("orthogonal hand-overs that succeed", _handover),
-    "moving": Metric(f"options that move the ant, switched at random every {SWITCHED_EVERY} control steps", _moving),
+    "moving": Metric(
+        f"options that gain {IDLE_SPEED} m/s or more along their direction, switched at random every {SWITCHED_EVERY} "
+        "control steps",
+        _moving,
+    ),
     "idle": Metric(
-        f"options that hardly move the ant, switched at random every {SWITCHED_EVERY} control steps",
+        f"options that gain less than {IDLE_SPEED} m/s along their direction, switched at random every "
+        f"{SWITCHED_EVERY} control steps",
         partial(_switched, "idle"),
     ),
     "upside down": Metric(

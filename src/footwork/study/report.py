@@ -20,7 +20,7 @@ from footwork.study.answers import ANSWERS, choices, said
 from footwork.study.claims import CLAIMS, Claim, rows_read
 from footwork.study.experiments import SCHEDULES, find_row, in_braces
 from footwork.study.figures import FIGURES, Drawn, count_in_words, draw_figures
-from footwork.study.judging import Finding, Judgement, judge_all, show_bound, show_chance, show_effect
+from footwork.study.judging import Finding, Judgement, judge_all, no_room, show_bound, show_chance, show_effect
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import Block, Bullets, Code, Heading, Picture, TableBlock, Text, markdown, page
 from footwork.study.plan import default_rows, plan, read_machine
@@ -92,9 +92,11 @@ def _reading() -> tuple[str, ...]:
         "An effect is a difference of interquartile means over seeds with its 95 % stratified-bootstrap interval, "
         "whole seeds drawn within each row; differences of shares are in percentage points. P is the probability that "
         "a run of the first row scores higher than one of the second.",
-        "Rules, margins and the number of seeds asked for stood in footwork/study/claims.py before the runs. A "
-        "difference that was to be at least the margin and is smaller, or of the other sign, does not hold. "
-        "Comparisons that are only shown do not decide; most of them were added after the first seeds had been seen.",
+        "Rules, margins and the number of seeds asked for stood in footwork/study/claims.py before the study's runs, "
+        "after pilots of one to three seeds of the same kinds. By these the stay of interleaved rows was chosen, for "
+        "random switching, which is shown at claim 14; no t of the paper's kinds was. A difference that was to be at "
+        "least the margin and is smaller, or of the other sign, does not hold. Comparisons that are only shown do not "
+        "decide; most of them were added after the first seeds had been seen.",
         "Way: how much nearer to the goal an episode ends than it began, along the straight line, as a share of the "
         "distance at the start. That is the distance part of the paper's reward, which is what it plots, and what "
         "masters and flat policies are judged by. On AntMaze it calls an ant at the wall nearer than one half-way "
@@ -104,14 +106,14 @@ def _reading() -> tuple[str, ...]:
         f"{HANDOVER_SPEED} m/s or more, over all of them and along the second direction. Orthogonal ones count: eight "
         "of sixteen pairs. One hand-over from walking is easier than one after the other: under random switching for "
         f"{SWITCHING_STEPS} steps, shown beside it, a direction is drawn from all four every {SWITCHED_EVERY} steps, "
-        f"and an option that moves the ant at less than {IDLE_SPEED} m/s is idle.",
+        f"and an option that gains less than {IDLE_SPEED} m/s along its direction is idle, wherever else the ant goes.",
         "Claim 13 compares masters that stand on the same sub-policies: seed by seed, that is with their seeds drawn "
         "together (decided before a penalised master was trained; for claim 9 it is shown only). Elsewhere rows are "
         "taken to be independent. They are not quite, where they share sub-policies or, under appropriate bias, "
         "partners: such intervals are rather too wide than too narrow.",
         "Nothing is corrected for the number of comparisons. With 10 seeds an interval of a difference of means covers "
         "the truth 92 to 96 times in 100, of a difference of spreads 90 times, with 3 seeds under 80 times (normal "
-        "scores, simulated).",
+        "scores, simulated); of 3 seeds a lone row's interval is their range.",
     )
 
 
@@ -120,10 +122,10 @@ def _rows_read(results: Results) -> str:
         "Interquartile means over seeds with 95 % intervals. Control steps: of one run, all its directions counted. "
         "Minutes: of training, mean over runs, one core each, without the measuring that follows "
         f"({results.study.size.episodes} episodes, drawn from the policy and not its mean, or the hand-over matrix and "
-        "random switching). Hand-overs: orthogonal ones that succeed. Idle, upside down: options that hardly move the "
-        f"ant, and ants in the end, switched at random every {SWITCHED_EVERY} control steps. Way: along the straight "
-        "line. Within: episodes that come so near to the goal. Turned over: at any time of an episode. One row with "
-        "what it stands on: `footwork reproduce --rows ROW`."
+        "random switching). Hand-overs: orthogonal ones that succeed. Idle, upside down: options that gain less than "
+        f"{IDLE_SPEED} m/s along their direction, and ants in the end, switched at random every {SWITCHED_EVERY} "
+        "control steps. Way: along the straight line. Within: episodes that come so near to the goal. Turned over: at "
+        "any time of an episode. One row with what it stands on: `footwork reproduce --rows ROW`."
     )
 
 
@@ -171,7 +173,7 @@ def _summary(results: Results, judgements: Sequence[Judgement], rows: Sequence[s
 
 
 _STANDINGS = ("Holds", "Does not hold", "Undecided with all seeds", "Undecided, too few seeds", "Runs missing")
-_SETTINGS = {"paper": "the paper's setting", "hrl": "our setting"}
+_SETTINGS = {"paper": "the paper's reward", "hrl": "our reward"}
 
 
 def _standing(j: Judgement) -> str:
@@ -192,7 +194,13 @@ def _overview_table(judgements: Sequence[Judgement]) -> TableBlock:
         elsewhere = [j for j in mine if j.setting.prefix]
         cells = [_brief(paper), _brief(ours), _brief(elsewhere, named=True)]
         rows.append((str(claim.number), f"{claim.words}\n({_source(claim)})", *cells))
-    header = ("", "claim", "the paper's setting", "our reward, our masters' schedule", "other ants and engines")
+    header = (
+        "",
+        "claim",
+        "the paper's reward and schedule",
+        "our reward, our masters' schedule",
+        "other ants and engines",
+    )
     return TableBlock(header, tuple(rows))
 
 
@@ -205,7 +213,8 @@ def _brief(judgements: Sequence[Judgement], named: bool = False) -> str:
         nothing = not any(any(f.seeds) for f in j.findings)
         missing = "" if deciding else ": no runs yet" if nothing else ": runs of one side only"
         lines.append(f"{place}**{j.verdict}**{so_far}{missing}")
-        lines += [_said(f) for f in ([f for f in deciding if f.so_far == j.so_far] or deciding)[:1]]
+        for f in ([f for f in deciding if f.so_far == j.so_far] or deciding)[:1]:
+            lines.append("; ".join(filter(None, (_said(f), no_room(f)))))
         lines += [f"and {len(deciding) - 1} more"] if len(deciding) > 1 else []
     return "\n".join(lines) or "-"
 

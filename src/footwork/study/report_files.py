@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+
+import jax
+import numpy as np
 
 from footwork import checkpoint
 from footwork.checkpoint import CheckpointError
@@ -11,7 +15,7 @@ from footwork.record import RunError
 from footwork.study.measure import files_of
 from footwork.study.plan import STUDY_FILE, Study, read_mark
 from footwork.study.results import Results, Sample, all_rows
-from footwork.study.runs import read_actors
+from footwork.study.runs import NEEDED, read_actors
 from footwork.study.training_curves import CURVE, copy_curve
 
 RESULTS = "results"  # folder of a report, with the small files of its runs
@@ -85,6 +89,7 @@ def export(results: Results, to: Path) -> None:
         shutil.rmtree(left, ignore_errors=True)
     new.mkdir(parents=True)
     for row, samples in results.all_samples().items():
+        _say_what_stands_elsewhere(results, samples)
         for sample in {sample.run: sample for sample in samples}.values():
             name = f"{row}/{sample.run.path.name}"
             had = (to / name / sample.run.policy_path.name).is_file()
@@ -103,6 +108,28 @@ def export(results: Results, to: Path) -> None:
         to.rename(old)
     new.rename(to)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _say_what_stands_elsewhere(results: Results, samples: Sequence[Sample]) -> None:
+    """Seed i of a row is to stand on seed i of the row it needs: what it kept of that is compared with what is there.
+
+    A report's own results keep no such copy; there nothing can be compared.
+    """
+    for sample in samples:
+        kept, needs = sample.run.path / NEEDED, sample.experiment.needs
+        under = {other.seed: other for other in results.samples(needs)} if needs and kept.is_file() else {}
+        if sample.seed not in under:
+            continue
+        needed = under[sample.seed]
+        try:
+            mine = jax.tree.leaves(read_actors(kept)[0])
+            theirs = [leaf[needed.index] for leaf in jax.tree.leaves(read_actors(needed.run.policy_path)[0])]
+        except CheckpointError as error:
+            results.problems[f"{error}: what {sample.run.path} stands on cannot be told"] = None
+            continue
+        if len(mine) != len(theirs) or not all(map(np.array_equal, (leaf[0] for leaf in mine), theirs)):
+            said = f"{sample.run.path} stands on other policies than those of {needed.run.path}"
+            results.problems[said] = None
 
 
 def _copy_run(results: Results, sample: Sample, place: Path, row: str, with_policy: bool) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from footwork.evaluate import IDLE_SPEED
 from footwork.study.claims import MIN_SEEDS, Setting
 from footwork.study.experiments import ANNEALED, WALKERS, find_row, is_row
 from footwork.study.figures import count_in_words
@@ -64,13 +65,14 @@ def side_by_side_caption(results: Results) -> str:
     four, one, bandit, maze, flat = (count_in_words(row.total_steps * row.runs_per_seed) for row in rows)
     return (
         "Shares in per cent, interquartile means over seeds with 95 % intervals (one without width says only that the "
-        f"seeds agree); (3): of 3 seeds instead of {MIN_SEEDS}. Hand-overs: orthogonal ones that succeed. k = "
-        f"{SWITCHED_EVERY}: switched at random every {SWITCHED_EVERY} control steps, options that hardly move the ant "
-        "(idle), ants upside down in the end. The tasks: episodes in which a master on these sub-policies, or a flat "
-        "policy, comes within 1 m of the goal "
-        "(both settings); free: without stability penalties. Control steps of training: four sub-policies "
-        f"{four}, a symmetric one {one}, masters {bandit} on AntBandit and {maze} on AntMaze besides, flat policies "
-        f"{flat}."
+        f"seeds agree); (3): of 3 seeds instead of {MIN_SEEDS}, whose interval is only their range. Hand-overs: "
+        "orthogonal ones that succeed, as said above. k = "
+        f"{SWITCHED_EVERY}: switched at random every {SWITCHED_EVERY} control steps, options that gain less than "
+        f"{IDLE_SPEED} m/s along their direction (idle), ants upside down in the end. The tasks: episodes in which a "
+        "master on these sub-policies, or a flat policy, comes within 1 m of the goal (both settings); free: without "
+        f"stability penalties. Control steps of training: four sub-policies {four} (those of appropriate bias stand on "
+        f"as many of plain ones), a symmetric one {one}, masters {bandit} on AntBandit and {maze} on AntMaze besides, "
+        f"flat policies {flat}."
     )
 
 

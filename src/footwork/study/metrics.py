@@ -100,13 +100,13 @@ def _speed(results: Results, sample: Sample) -> float | None:
     return None if entry is None else float(np.mean([entry["speed_mps"][name] for name in DIRECTIONS]))
 
 
-def _handover(results: Results, sample: Sample) -> float | None:
-    """Between orthogonal directions: the eight of the sixteen pairs that are a quarter turn apart."""
+def _handover(name: str, results: Results, sample: Sample) -> float | None:
+    """Mean between orthogonal directions: the eight of the sixteen pairs that are a quarter turn apart."""
     entry = results.entry(sample, TRANSITIONS)
     if entry is None:
         return None
     pairs = [(i, (i + turn) % 4) for i in range(4) for turn in (1, 3)]
-    return float(np.mean([entry["handover"][i][j]["success"] for i, j in pairs]))
+    return float(np.mean([entry["handover"][i][j][name] for i, j in pairs]))
 
 
 def _fluctuation(results: Results, sample: Sample) -> Any:
@@ -194,7 +194,10 @@ METRICS: dict[str, Metric] = {
     "fluctuation": Metric(
         "training return's deviation from one hundredth of training to the next", _fluctuation, _RETURN
     ),
-    "handover": Metric("orthogonal hand-overs that succeed", _handover),
+    "handover": Metric("orthogonal hand-overs that succeed", partial(_handover, "success")),
+    "handover speed": Metric(
+        "speed along the new direction after orthogonal hand-overs", partial(_handover, "speed_mps"), "m/s"
+    ),
     "moving": Metric(
         f"options that gain {IDLE_SPEED} m/s or more along their direction, switched at random every {SWITCHED_EVERY} "
         "control steps",

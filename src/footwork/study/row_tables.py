@@ -15,7 +15,13 @@ from footwork.study.pages import TableBlock
 from footwork.study.results import Results, prefixes_at_hand
 
 _SWITCHED = {f"idle, k = {SWITCHED_EVERY}": "idle", f"upside down, k = {SWITCHED_EVERY}": "upside down"}
-_OF_SUB_POLICIES = {"m/s": "speed", "training return": "return", "hand-overs": "handover", **_SWITCHED}
+_OF_SUB_POLICIES = {
+    "m/s": "speed",
+    "training return": "return",
+    "hand-overs": "handover",
+    "m/s after": "handover speed",
+    **_SWITCHED,
+}
 _OF_POLICIES = {
     "way": "way",
     "around walls": "route",

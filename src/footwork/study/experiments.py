@@ -265,8 +265,8 @@ ANNEALED_MASTERS: tuple[Experiment, ...] = tuple(
     for row in ANNEALED
 )
 
-# Rows of the light ant: what claims 7 to 12 and 14 read. Table 1's constant step does not teach it to walk, so that
-# the annealed rows are where its hand-overs say something.
+# Rows of the light ant: what claims 7 to 12 and 14 read. With a bonus and a step that stay it does not learn to walk,
+# so that the annealed rows are where its hand-overs say something.
 LIGHT_KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias", "interleaved")
 LIGHT: tuple[Experiment, ...] = (
     *(MAIN[f"walker/{kind}"] for kind in LIGHT_KINDS),

@@ -158,8 +158,8 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
     lines = (
         ("B, the potential, how flat policies learn: masters, flat policies", tasks, ("way", "route", "success")),
         (
-            "B, annealing and the ant: sub-policies",
-            [*walkers, *_ANNEALED, *(row for row in _OF_ANTS if find_row(row).is_walker)],
+            "B, the entropy bonus, annealing and the ant: sub-policies",
+            [*walkers, *_ANNEALED, _WITH_BONUS, *(row for row in _OF_ANTS if find_row(row).is_walker)],
             ("handover", "moving", "speed"),
         ),
         (
@@ -178,7 +178,9 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
 
 
 _COMPARED_GRIDS = tuple(
-    grid for grid in GRIDS if grid.field in ("ppo.minibatch_size", "task.potential") or grid.name in FLAT_GRIDS
+    grid
+    for grid in GRIDS
+    if grid.field in ("ppo.minibatch_size", "task.potential", "ppo.ent_coef") or grid.name in FLAT_GRIDS
 )
 _OF_ANTS = tuple(
     f"{ant}{row}"
@@ -186,6 +188,7 @@ _OF_ANTS = tuple(
     for row in (f"{place}/plain", f"{annealed}/plain", f"{place}/interleaved")
     for ant in ("", "light/")
 )
+_WITH_BONUS = "light/ablation/walker/bonus/0.02"  # as the heavy ant's have it
 _ANNEALED = tuple(row for one in ANNEALED for row in (one.name.replace("ablation/annealed", "walker"), one.name))
 _ANNEALED_MASTERS = tuple(
     row
@@ -200,6 +203,7 @@ COMPARED: tuple[str, ...] = tuple(
             *(row for grid in _COMPARED_GRIDS for row in grid.points().values()),
             *_ANNEALED,
             *_ANNEALED_MASTERS,
+            _WITH_BONUS,
             *_OF_ANTS,
         )
     )

@@ -157,7 +157,7 @@ PAIRS = hnp.arrays(np.float64, st.tuples(st.integers(3, 12), st.just(2)), elemen
 @given(PAIRS)
 def test_rank_correlation_of_one_group_is_spearmans(pairs):
     if any(len(set(side)) == 1 for side in pairs.T):
-        with pytest.raises(ValueError, match="does not vary"):
+        with pytest.raises(ValueError, match="both sides vary"):
             statistics.rank_correlation([pairs], np.random.default_rng(0), draws=10)
         return
     found = statistics.rank_correlation([pairs], np.random.default_rng(0), draws=50)
@@ -173,6 +173,13 @@ def test_what_sets_groups_apart_is_no_rank_correlation():
     assert statistics.rank_correlation(groups, key, draws=50) == pytest.approx((1, 1, 1))
     stretched = [np.exp(group / 100) for group in groups]
     assert statistics.rank_correlation(stretched, key, draws=50).estimate == pytest.approx(1)
+
+
+def test_a_group_at_its_ceiling_takes_nothing_from_a_rank_correlation():
+    rising = np.column_stack([np.arange(8.0), np.arange(8.0)])
+    at_ceiling = np.column_stack([np.ones(8), np.arange(8.0)])
+    found = statistics.rank_correlation([rising, at_ceiling], np.random.default_rng(0), draws=50)
+    assert found.estimate == pytest.approx(1)
 
 
 def test_intervals_of_a_rank_correlation_cover_as_often_as_they_say():

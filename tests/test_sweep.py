@@ -290,6 +290,12 @@ def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):
     checkpoint.save(master.path / NEEDED, other.params, policy_meta(other.experiment, (1,), 0))
     export(results, tmp_path / "out/other")
     assert f"{master.path} stands on other policies than those of {run.path}" in results.problems
+    (run.path / "DONE").unlink()
+    results = Results(study)
+    results.samples("bandit/hrl/symmetric")
+    export(results, tmp_path / "out/alone")
+    said = f"{master.path} stands on walker/symmetric seed 1, of which there is no run that counts"
+    assert said in results.problems
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="ray is installed")

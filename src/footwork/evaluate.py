@@ -24,7 +24,7 @@ from footwork.tasks.task import SUCCESS_RADII, Task
 from footwork.train import Experiment, Trained, choices_of
 from footwork.types import Array, Key, Params
 
-IDLE_SPEED = 0.2  # m/s; an option slower than this has not moved the ant
+IDLE_SPEED = 0.2  # m/s; an option that gains less than this along its direction is idle
 SWITCHING_STEPS = 2000  # control steps of random switching
 SWITCHING_PERIODS = (25, 50, 100, 200)  # control steps per option
 HANDOVER_AFTER = (100, 200)  # control steps of the first policy, uniform in this range in multiples of the segment

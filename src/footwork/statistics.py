@@ -153,20 +153,22 @@ def rank_correlation(groups: Sequence[npt.ArrayLike], generator: np.random.Gener
     """Spearman's correlation of pairs [S, 2] within groups, with its stratified-bootstrap interval.
 
     Ranks are taken within each group, ties sharing theirs, and counted from the group's mean, so that what sets
-    groups apart adds nothing; with one group it is Spearman's rho. Each group's pairs are resampled on their own. A
-    resample in which nothing varies counts as no correlation.
+    groups apart adds nothing; with one group it is Spearman's rho. A group in which one side is constant says nothing
+    and is left out; a larger group weighs more, about as the cube of its size. Each group's pairs are resampled on
+    their own; a resample in which nothing varies counts as no correlation.
 
     Raises:
-        ValueError: there are no pairs, they are not finite, or one side does not vary within any group.
+        ValueError: there are no pairs, they are not finite, or there is no group in which both sides vary.
     """
     pairs = [np.asarray(group, np.float64) for group in groups]
     if not pairs or any(group.ndim != 2 or group.shape[1] != 2 or not len(group) for group in pairs):
         raise ValueError(f"groups of pairs [seeds, 2], got shapes {[group.shape for group in pairs]}")
     if not all(np.isfinite(group).all() for group in pairs):
         raise ValueError("pairs must be finite")
+    pairs = [group for group in pairs if all(np.ptp(side) for side in group.T)]
+    if not pairs:
+        raise ValueError("there is no group in which both sides vary")
     here = _pooled_correlation([group[None] for group in pairs])[0]
-    if np.isnan(here):
-        raise ValueError("one side does not vary within any group")
     drawn = _pooled_correlation([group[draw_seeds(len(group), draws, generator)] for group in pairs])
     low, high = percentile_interval(np.nan_to_num(drawn))
     return Effect(float(here), float(low), float(high))

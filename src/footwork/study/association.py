@@ -6,16 +6,14 @@ that sub-policies which hand over smoothly serve a master better; it compares ki
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from footwork.statistics import DRAWS, Effect, Floats, generator_for, rank_correlation
-from footwork.study.experiments import WALKERS, is_row
+from footwork.study.experiments import KINDS, is_row
 from footwork.study.results import Results
 
-KINDS = tuple(row.name.removeprefix("walker/") for row in WALKERS)
 OF_SUB_POLICIES, OF_MASTERS = "handover", "success"  # the metric of sub-policies, and that of the masters on them
 
 
@@ -66,12 +64,11 @@ def seed_pairs(results: Results, association: Association, prefix: str = "") -> 
 
 
 def strength(results: Results, association: Association, prefix: str = "", draws: int = DRAWS) -> Effect | None:
-    """The rank correlation of the pairs within kinds; None where nothing varies or there are fewer than three seeds."""
-    groups: Sequence[Floats] = [pairs for pairs in seed_pairs(results, association, prefix).values() if len(pairs) > 2]
-    try:
-        return rank_correlation(groups, generator_for(f"association {prefix}{association.place}"), draws)
-    except ValueError:
-        return None
+    """The rank correlation of the pairs within kinds; None where no kind has three seeds and varies on both sides."""
+    found = seed_pairs(results, association, prefix).values()
+    groups = [pairs for pairs in found if len(pairs) > 2 and all(np.ptp(side) for side in pairs.T)]
+    generator = generator_for(f"association {prefix}{association.place}")
+    return rank_correlation(groups, generator, draws) if groups else None
 
 
-__all__ = ["ASSOCIATIONS", "KINDS", "OF_MASTERS", "OF_SUB_POLICIES", "Association", "seed_pairs", "strength"]
+__all__ = ["ASSOCIATIONS", "OF_MASTERS", "OF_SUB_POLICIES", "Association", "seed_pairs", "strength"]

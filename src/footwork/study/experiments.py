@@ -85,6 +85,8 @@ WALKERS: tuple[Experiment, ...] = (
     ),
 )
 
+KINDS = tuple(row.name.removeprefix("walker/") for row in WALKERS)  # of sub-policies
+
 
 def _guided(task: Task) -> Task:
     """Ours: arriving pays what some 3 m of progress pay, and coordinates are scaled to about +-1."""
@@ -237,7 +239,7 @@ GRIDS: tuple[Grid, ...] = (
 # Those of them that vary a flat policy, and in what.
 FLAT_GRIDS: dict[str, str] = {
     "ablation/bandit/flat-free-bonus": "without an entropy bonus",
-    "ablation/bandit/flat-free-deviation": "its deviation capped",
+    "ablation/bandit/flat-free-deviation": "its deviation capped at 1.6 instead of 7.4",
     "ablation/bandit/flat-free-annealing": "annealed",
     "ablation/bandit/flat-penalised-bonus": "without an entropy bonus",
 }
@@ -272,14 +274,13 @@ def _without_bonus(row: Experiment) -> Experiment:
 
 
 # Rows of the light ant: what claims 7 to 12 and 14 read, and those of them annealed. Its sub-policies get no entropy
-# bonus: with the heavy ant's they do not learn to walk (its last row here), as some of the heavy ant's do not without.
+# bonus: with the heavy ant's, plain ones and the paper's do not learn to walk (LIGHT_WITH_BONUS).
 LIGHT_KINDS = ("plain", "random-start", "random-repeated", "appropriate-bias", "interleaved")
 LIGHT: tuple[Experiment, ...] = (
     *(_without_bonus(MAIN[f"walker/{kind}"]) for kind in LIGHT_KINDS),
     *(MAIN[f"{place}/hrl/{kind}"] for place in ("bandit", "maze") for kind in LIGHT_KINDS),
     *map(_without_bonus, ANNEALED),
     *ANNEALED_MASTERS,
-    replace(MAIN["walker/plain"], name=f"ablation/walker/bonus/{PAPER.ent_coef}"),
 )
 
 
@@ -307,11 +308,15 @@ def with_robot(experiment: Experiment, robot: Robot) -> Experiment:
     return replace(experiment, task=replace(experiment.task, robot=robot))
 
 
+LIGHT_WITH_BONUS = _of_robot(
+    replace(MAIN["walker/plain"], name=f"ablation/walker/bonus/{PAPER.ent_coef}"), ROBOTS["light"]
+)
+
 EXPERIMENTS: dict[str, Experiment] = {
     **MAIN,
     **{row.name: row for grid in GRIDS for row in grid.rows()},
     **{row.name: row for row in (*ANNEALED, *ANNEALED_MASTERS)},
-    **{row.name: row for row in (_of_robot(row, ROBOTS["light"]) for row in LIGHT)},
+    **{row.name: row for row in (*(_of_robot(row, ROBOTS["light"]) for row in LIGHT), LIGHT_WITH_BONUS)},
 }
 
 

@@ -22,7 +22,7 @@ from footwork.statistics import (
 )
 from footwork.study.claims import CLAIMS, Claim, Contrast, Rule, Setting, Verdict, settings_of
 from footwork.study.experiments import SCHEDULES, find_row, in_braces, is_row
-from footwork.study.measure import straight_line_stop
+from footwork.study.measure import EVALUATION, STUCK_WITHIN, straight_line_stop
 from footwork.study.metrics import METRICS
 from footwork.study.results import Results, prefixes_at_hand, seeds_in_words
 
@@ -39,7 +39,7 @@ class Finding:
     verdict: Verdict
     so_far: Verdict  # what the rule says if the number of seeds is not asked for
     room: float | None = None  # the most that a difference of shares could be: what the other row leaves
-    at_wall: bool = False  # nobody on either side got past where the straight line meets the wall: room ends there
+    at_wall: bool = False  # room ends where the straight line meets a wall: nobody on either side ended beyond it
 
 
 @dataclass(frozen=True)
@@ -96,12 +96,21 @@ def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> F
 
 
 def _way_to_wall(results: Results, what: Contrast, rows: Sequence[str]) -> float | None:
-    """The share of the way at which the straight line meets a wall, if no episode of these rows got past it."""
+    """The share of the way at which the straight line meets a wall, if no episode ended nearer to the goal than that.
+
+    Within a metre, since the ant's body and the place where it stands along the wall leave some room.
+    """
     arena = find_row(rows[0]).task.arena
     stop = straight_line_stop(arena) if what.metric == "way" else None
-    if stop is None or any(results.scores(row, "success far").any() for row in rows):
+    if stop is None:
         return None
-    return 1.0 - math.dist(stop, arena.goals[0]) / math.dist(arena.start, arena.goals[0])
+    whole, left = math.dist(arena.start, arena.goals[0]), math.dist(stop, arena.goals[0])
+    for row in rows:
+        for entry in results.measurements(row, EVALUATION):
+            ends = np.array(entry["ends"], np.float64)
+            if (np.hypot(*(ends - np.array(arena.goals[0])).T) < left - STUCK_WITHIN).any():
+                return None
+    return 1.0 - left / whole
 
 
 def _effect(
@@ -208,8 +217,10 @@ def no_room(finding: Finding) -> str:
     """What is said of a comparison in which the other row leaves less than the smallest difference that matters."""
     if finding.room is None or finding.room >= finding.contrast.bound:
         return ""
-    short_of = " without getting past the wall, which nobody did" if finding.at_wall else ""
-    return f"no more than {100 * max(finding.room, 0.0):.1f} points were possible{short_of}"
+    if finding.at_wall:
+        points = 100 * max(finding.room, 0.0)
+        return f"about {points:.1f} points were possible up to the wall, and nobody ended beyond it"
+    return f"no more than {100 * finding.room:.1f} points were possible"
 
 
 def is_reversed(finding: Finding) -> bool:

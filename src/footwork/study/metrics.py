@@ -156,7 +156,7 @@ def _switched(name: str, results: Results, sample: Sample) -> float | None:
 
 
 def _moving(results: Results, sample: Sample) -> float | None:
-    """Options of random switching in which the ant gets on along its direction at all."""
+    """Options of random switching that are not idle."""
     idle = _switched("idle", results, sample)
     return None if idle is None else 1.0 - idle
 
@@ -172,7 +172,6 @@ def _transitions(results: Results, sample: Sample) -> float | None:
 METRICS: dict[str, Metric] = {
     "way": Metric("share of the straight-line way to the goal", partial(_evaluated, "way")),
     "success": Metric("episodes that come within 1 m of the goal", partial(_success, 1.0)),
-    "success far": Metric("episodes that come within 5 m of the goal", partial(_success, 5.0)),
     "success close": Metric("episodes that come within 0.5 m of the goal", partial(_success, 0.5)),
     "route": Metric("share of the shortest way around the walls", _route),
     "stuck": Metric("episodes that end where the straight line meets the wall", partial(_evaluated, "stuck")),

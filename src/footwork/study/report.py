@@ -49,11 +49,23 @@ def write_report(results: Results, to: Path, command: str) -> list[Path]:
         results.samples(row)
     export(results, to / RESULTS)  # first: it may refuse, and may find what is wrong with a file, which the pages say
     drawn = [one for prefix in prefixes for one in draw_figures(results, FIGURES, to / "figures", prefix)]
+    _remove_older_figures(to / "figures", drawn)
     blocks = report_blocks(results, drawn, command)
     pages = {"REPORT.md": markdown(blocks, to), "report.html": page(blocks, _title(results))}
     for name, text in pages.items():
         write_atomically(to / name, text.encode())
     return [to / name for name in pages]
+
+
+def _remove_older_figures(place: Path, drawn: Sequence[Drawn]) -> None:
+    """Figures of an earlier report that this one does not draw: of another ant's rows that are no longer there."""
+    here = {file for one in drawn for file in one.files}
+    known = {figure.name for figure in FIGURES}
+    for path in [*place.rglob("*.png"), *place.rglob("*.svg")]:
+        if path.stem in known and path not in here:
+            path.unlink()
+            if not any(path.parent.iterdir()):
+                path.parent.rmdir()
 
 
 def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> list[Block]:

@@ -88,6 +88,9 @@ def export(results: Results, to: Path) -> None:
     for left in (new, old):
         shutil.rmtree(left, ignore_errors=True)
     new.mkdir(parents=True)
+    for samples in results.all_samples().values():  # what they stand on is copied and looked at too
+        for needs in {sample.experiment.needs for sample in samples} - {None}:
+            results.samples(str(needs))
     for row, samples in results.all_samples().items():
         _say_what_stands_elsewhere(results, samples)
         for sample in {sample.run: sample for sample in samples}.values():
@@ -117,10 +120,13 @@ def _say_what_stands_elsewhere(results: Results, samples: Sequence[Sample]) -> N
     """
     for sample in samples:
         kept, needs = sample.run.path / NEEDED, sample.experiment.needs
-        under = {other.seed: other for other in results.samples(needs)} if needs and kept.is_file() else {}
-        if sample.seed not in under:
+        if needs is None or not kept.is_file():
             continue
-        needed = under[sample.seed]
+        needed = next((other for other in results.samples(needs) if other.seed == sample.seed), None)
+        if needed is None:
+            said = f"{sample.run.path} stands on {needs} seed {sample.seed}, of which there is no run that counts"
+            results.problems[said] = None
+            continue
         try:
             mine = jax.tree.leaves(read_actors(kept)[0])
             theirs = [leaf[needed.index] for leaf in jax.tree.leaves(read_actors(needed.run.policy_path)[0])]

@@ -8,7 +8,7 @@ import numpy as np
 
 from footwork.evaluate import IDLE_SPEED
 from footwork.study.claims import MIN_SEEDS, Setting
-from footwork.study.experiments import ANNEALED, WALKERS, find_row, is_row
+from footwork.study.experiments import ANNEALED, KINDS, find_row, is_row
 from footwork.study.figures import count_in_words
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import TableBlock
@@ -36,11 +36,10 @@ _SETTINGS = {
     "AntBandit, the paper's": ("bandit", "paper"),
     "AntMaze, the paper's": ("maze", "paper"),
 }
-_KINDS = tuple(row.name.removeprefix("walker/") for row in WALKERS)
 _ANNEALED_KINDS = tuple(row.name.rpartition("/")[2] for row in ANNEALED)
 # A line's name, the row of its sub-policies, and those of its masters or flat policies: of any task and setting.
 _LINES: tuple[tuple[str, str, str], ...] = (
-    *((kind, f"walker/{kind}", f"{{place}}/{{schedule}}/{kind}") for kind in _KINDS),
+    *((kind, f"walker/{kind}", f"{{place}}/{{schedule}}/{kind}") for kind in KINDS),
     *(
         (f"{kind}, annealed", f"ablation/annealed/{kind}", f"ablation/{{place}}/{{schedule}}-annealed/{kind}")
         for kind in _ANNEALED_KINDS

@@ -9,9 +9,8 @@ import numpy as np
 from footwork.arena import DIRECTIONS
 from footwork.statistics import Effect, Floats, contrast, generator_for, iqm, profile_band
 from footwork.study.association import ASSOCIATIONS, OF_MASTERS, OF_SUB_POLICIES, seed_pairs, strength
-from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, FLAT_GRIDS, GRIDS, Grid, find_row
+from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, FLAT_GRIDS, GRIDS, LIGHT_WITH_BONUS, Grid, find_row
 from footwork.study.figures.style import (
-    LOOKS,
     Look,
     empty,
     interval_marks,
@@ -188,7 +187,7 @@ _OF_ANTS = tuple(
     for row in (f"{place}/plain", f"{annealed}/plain", f"{place}/interleaved")
     for ant in ("", "light/")
 )
-_WITH_BONUS = "light/ablation/walker/bonus/0.02"  # as the heavy ant's have it
+_WITH_BONUS = LIGHT_WITH_BONUS.name
 _ANNEALED = tuple(row for one in ANNEALED for row in (one.name.replace("ablation/annealed", "walker"), one.name))
 _ANNEALED_MASTERS = tuple(
     row
@@ -232,13 +231,13 @@ def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) 
 
 def masters_by_handovers(results: Results, rows: tuple[str, ...]) -> Any:
     """A point per seed: how well its sub-policies hand over, and how often the master on them arrives."""
-    prefix = rows[0].partition("walker/")[0]
+    prefix = next(row for row in rows if "walker/" in row).partition("walker/")[0]
     there = [one for one in ASSOCIATIONS if any(row.startswith(f"{prefix}{one.place}/") for row in rows)]
     figure, axes = panels(1, len(there), 3.0, share_y=True)
     for ax, association in zip(axes[0], there, strict=True):
         found = seed_pairs(results, association, prefix)
         for kind, pairs in found.items():
-            look = LOOKS[kind]
+            look = look_of(kind)
             ax.plot(*pairs.T, ls="", marker=look.mark, color=look.colour, ms=4.5, alpha=0.75, mew=0, label=kind)
         effect = strength(results, association, prefix)
         rho = f"ρ = {effect.estimate:.2f} [{effect.low:.2f}, {effect.high:.2f}]" if effect else "ρ: -"

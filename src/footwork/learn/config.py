@@ -33,7 +33,9 @@ class PPOConfig:
     hidden_sizes: tuple[int, ...] = (64, 64)  # the paper's Section 4, for the actor and for the critic
 
     # Not in the paper.
-    ent_coef: float = 0.02  # times the entropy, added to the objective; at 0 some walkers never leave their stand
+    ent_coef: float = (
+        0.02  # times the entropy, added to the objective; in a pilot at 0 one of four walkers never walked
+    )
     anneal_updates: int | None = None  # updates in which ent_coef and learning_rate fall linearly; None: both stay
     final_ent_coef_share: float = 0.0  # of ent_coef, when annealed
     final_learning_rate_share: float = 0.1  # of learning_rate, when annealed

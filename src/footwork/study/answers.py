@@ -311,7 +311,7 @@ def choices(study: Study) -> tuple[Choice, ...]:
         ),
         Choice(
             "PPO beside Table 1",
-            f"entropy bonus {table_1.ent_coef} (without it some walkers never leave their stand), advantages "
+            f"entropy bonus {table_1.ent_coef} (in a pilot without it one of four never walked), advantages "
             f"normalised per update, Adam's epsilon {table_1.adam_eps:g}, log-deviation {table_1.initial_log_std:g} at "
             "first; no schedule of the learning rate, no gradient clipping. The light ant's sub-policies get no bonus, "
             "since plain ones and the paper's were seen not to walk with it",

@@ -36,6 +36,7 @@ from footwork.study.experiments import (
     FLAT_GRIDS,
     GRIDS,
     GRIDS_BY_NAME,
+    INTERLEAVED_WITHOUT,
     LIGHT_WITH_BONUS,
     MAIN,
     find_row,
@@ -613,6 +614,24 @@ def test_shown_comparisons_do_not_decide_and_rows_of_ablations_do_not_ask_for_te
     assert find_row("light/ablation/annealed/appropriate-bias").regulariser.partners == "light/ablation/annealed/plain"
     assert find_row("light/ablation/maze/hrl-annealed/plain").needs == "light/ablation/annealed/plain"
     assert not any("ablation" in row for row in claims.rows_read(("", "light/")))
+
+
+def test_each_part_of_interleaving_is_left_out_alone():
+    whole, master = find_row("walker/interleaved"), find_row("maze/hrl/interleaved")
+    restored = {
+        "cooperation": lambda row: replace(row, regulariser=whole.regulariser),
+        "annealing": lambda row: replace(row, ppo=whole.ppo),
+        "ends-on-the-back": lambda row: replace(row, task=whole.task),
+    }
+    assert [row.name.rpartition("/")[2] for row in INTERLEAVED_WITHOUT] == list(restored)
+    for row in INTERLEAVED_WITHOUT:
+        part = row.name.rpartition("/")[2]
+        assert replace(row, name=whole.name) != whole
+        assert restored[part](replace(row, name=whole.name)) == whole
+        on_it = find_row(f"ablation/maze/hrl-interleaved-without/{part}")
+        assert on_it.needs == row.name
+        assert replace(on_it, name=master.name, sub_policies=whole.name) == master
+    assert find_row("ablation/interleaved-without/annealing").ppo == PAPER
 
 
 def test_the_light_ants_sub_policies_get_no_bonus():

@@ -13,7 +13,14 @@ from footwork.learn.config import PAPER
 from footwork.statistics import iqm
 from footwork.study.association import ASSOCIATIONS, Association, strength
 from footwork.study.claims import PAPER_REGULARISERS
-from footwork.study.experiments import FLAT_GRIDS, GRIDS_BY_NAME, in_braces, is_row
+from footwork.study.experiments import (
+    FLAT_GRIDS,
+    GRIDS_BY_NAME,
+    INTERLEAVED_WITHOUT,
+    INTERLEAVED_WITHOUT_MASTERS,
+    in_braces,
+    is_row,
+)
 from footwork.study.judging import Judgement, show_effect
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
@@ -271,7 +278,29 @@ ANSWERS: tuple[Answer, ...] = (
         ),
     ),
     Answer("9", "Moving straight to the target, the flat policy gets stuck in a wall", (4,), (16, 17)),
-    Answer("ours", "Interleaved sub-policies; one symmetric policy", (14, 15), (11, 12)),
+    Answer(
+        "ours",
+        "Interleaved sub-policies; one symmetric policy",
+        (14, 15),
+        (11, 12, 19),
+        shows=(
+            *(
+                _rows(metric, "walker/interleaved", *(row.name for row in INTERLEAVED_WITHOUT))
+                for metric in ("handover", "idle", "upside down", "speed")
+            ),
+            *(
+                _rows(
+                    "success",
+                    f"{place}/hrl/interleaved",
+                    *(row.name for row in INTERLEAVED_WITHOUT_MASTERS if f"/{place}/" in row.name),
+                )
+                for place in ("bandit", "maze")
+            ),
+        ),
+        built="interleaved rows hand ants over to each other while they train, count what an ant is then worth "
+        "to the others (cooperation), are annealed, and end episodes on the back: each of the last three is left "
+        "out once",
+    ),
 )
 
 

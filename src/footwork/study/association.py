@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from footwork.statistics import DRAWS, Effect, Floats, generator_for, rank_correlation
+from footwork.statistics import Effect, Floats, generator_for, rank_correlation
 from footwork.study.experiments import KINDS, is_row
 from footwork.study.results import Results
 
@@ -63,12 +63,12 @@ def seed_pairs(results: Results, association: Association, prefix: str = "") -> 
     return found
 
 
-def strength(results: Results, association: Association, prefix: str = "", draws: int = DRAWS) -> Effect | None:
+def strength(results: Results, association: Association, prefix: str = "") -> Effect | None:
     """The rank correlation of the pairs within kinds; None where no kind has three seeds and varies on both sides."""
     found = seed_pairs(results, association, prefix).values()
     groups = [pairs for pairs in found if len(pairs) > 2 and all(np.ptp(side) for side in pairs.T)]
     generator = generator_for(f"association {prefix}{association.place}")
-    return rank_correlation(groups, generator, draws) if groups else None
+    return rank_correlation(groups, generator) if groups else None
 
 
 __all__ = ["ASSOCIATIONS", "OF_MASTERS", "OF_SUB_POLICIES", "Association", "seed_pairs", "strength"]

@@ -257,16 +257,33 @@ ANNEALED: tuple[Experiment, ...] = tuple(
     )
     for row in WALKERS[:4]
 )
-# And masters on those.
-ANNEALED_MASTERS: tuple[Experiment, ...] = tuple(
-    replace(
-        MAIN[row.name.replace("ablation/annealed", f"{place}/hrl")],
-        name=row.name.replace("annealed", f"{place}/hrl-annealed"),
-        sub_policies=row.name,
-    )
-    for place in ("bandit", "maze")
-    for row in ANNEALED
+# What makes interleaved ones what they are: each of its parts taken away.
+_INTERLEAVED = MAIN["walker/interleaved"]
+INTERLEAVED_WITHOUT: tuple[Experiment, ...] = tuple(
+    replace(row, name=f"ablation/interleaved-without/{part}")
+    for part, row in {
+        "cooperation": _with_field(_INTERLEAVED, "regulariser.cooperative", False),
+        "annealing": replace(_INTERLEAVED, ppo=PAPER),
+        "ends-on-the-back": replace(_INTERLEAVED, task=ANT_WALKER),
+    }.items()
 )
+
+
+def _masters_on(rows: Iterable[Experiment], kind: str | None = None) -> tuple[Experiment, ...]:
+    """The masters of a kind, each row's own for none, on these sub-policies, under ``ablation/PLACE/hrl-...``."""
+    return tuple(
+        replace(
+            MAIN[f"{place}/hrl/{kind or row.name.rpartition('/')[2]}"],
+            name=row.name.replace("ablation/", f"ablation/{place}/hrl-"),
+            sub_policies=row.name,
+        )
+        for place in ("bandit", "maze")
+        for row in rows
+    )
+
+
+ANNEALED_MASTERS = _masters_on(ANNEALED)
+INTERLEAVED_WITHOUT_MASTERS = _masters_on(INTERLEAVED_WITHOUT, "interleaved")
 
 
 def _without_bonus(row: Experiment) -> Experiment:
@@ -315,7 +332,7 @@ LIGHT_WITH_BONUS = _of_robot(
 EXPERIMENTS: dict[str, Experiment] = {
     **MAIN,
     **{row.name: row for grid in GRIDS for row in grid.rows()},
-    **{row.name: row for row in (*ANNEALED, *ANNEALED_MASTERS)},
+    **{row.name: row for row in (*ANNEALED, *ANNEALED_MASTERS, *INTERLEAVED_WITHOUT, *INTERLEAVED_WITHOUT_MASTERS)},
     **{row.name: row for row in (*(_of_robot(row, ROBOTS["light"]) for row in LIGHT), LIGHT_WITH_BONUS)},
 }
 

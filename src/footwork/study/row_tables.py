@@ -8,7 +8,7 @@ import numpy as np
 
 from footwork.evaluate import IDLE_SPEED
 from footwork.study.claims import MIN_SEEDS, Setting
-from footwork.study.experiments import ANNEALED, KINDS, find_row, is_row
+from footwork.study.experiments import ANNEALED, INTERLEAVED_WITHOUT, KINDS, find_row, is_row
 from footwork.study.figures import count_in_words
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import TableBlock
@@ -43,6 +43,14 @@ _LINES: tuple[tuple[str, str, str], ...] = (
     *(
         (f"{kind}, annealed", f"ablation/annealed/{kind}", f"ablation/{{place}}/{{schedule}}-annealed/{kind}")
         for kind in _ANNEALED_KINDS
+    ),
+    *(
+        (
+            f"interleaved without {row.name.rpartition('/')[2].replace('-', ' ')}",
+            row.name,
+            row.name.replace("ablation/", "ablation/{place}/{schedule}-"),
+        )
+        for row in INTERLEAVED_WITHOUT
     ),
     *((f"flat policy, {kind}", "", f"{{place}}/flat/{{guided}}{kind}") for kind in ("free", "penalised")),
 )

@@ -9,7 +9,17 @@ import numpy as np
 from footwork.arena import DIRECTIONS
 from footwork.statistics import Effect, Floats, contrast, generator_for, iqm, profile_band
 from footwork.study.association import ASSOCIATIONS, OF_MASTERS, OF_SUB_POLICIES, seed_pairs, strength
-from footwork.study.experiments import ANNEALED, ANNEALED_MASTERS, FLAT_GRIDS, GRIDS, LIGHT_WITH_BONUS, Grid, find_row
+from footwork.study.experiments import (
+    ANNEALED,
+    ANNEALED_MASTERS,
+    FLAT_GRIDS,
+    GRIDS,
+    INTERLEAVED_WITHOUT,
+    INTERLEAVED_WITHOUT_MASTERS,
+    LIGHT_WITH_BONUS,
+    Grid,
+    find_row,
+)
 from footwork.study.figures.style import (
     Look,
     empty,
@@ -151,19 +161,19 @@ def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
-    """B, the potential, how flat policies learn, annealing, the ant: rows side by side, in three metrics."""
+    """B, the potential, how flat policies learn, annealing, interleaving, the ant: rows side by side, three metrics."""
     tasks = [row for grid in _COMPARED_GRIDS if "walker" not in grid.base for row in grid.points().values()]
     walkers = [row for grid in _COMPARED_GRIDS if "walker" in grid.base for row in grid.points().values()]
     lines = (
         ("B, the potential, how flat policies learn: masters, flat policies", tasks, ("way", "route", "success")),
         (
-            "B, the entropy bonus, annealing and the ant: sub-policies",
-            [*walkers, *_ANNEALED, _WITH_BONUS, *(row for row in _OF_ANTS if find_row(row).is_walker)],
+            "B, the entropy bonus, annealing, parts of interleaving, the ant: sub-policies",
+            [*walkers, *_ANNEALED, *_WITHOUT, _WITH_BONUS, *(row for row in _OF_ANTS if find_row(row).is_walker)],
             ("handover", "moving", "speed"),
         ),
         (
-            "annealing and the ant: masters",
-            [*_ANNEALED_MASTERS, *(row for row in _OF_ANTS if not find_row(row).is_walker)],
+            "annealing, parts of interleaving, the ant: masters",
+            [*_ANNEALED_MASTERS, *_WITHOUT_MASTERS, *(row for row in _OF_ANTS if not find_row(row).is_walker)],
             ("way", "route", "success"),
         ),
     )
@@ -195,6 +205,11 @@ _ANNEALED_MASTERS = tuple(
     if "/maze/" in one.name
     for row in (one.name.removeprefix("ablation/").replace("-annealed", ""), one.name)
 )
+_WITHOUT = ("walker/interleaved", *(row.name for row in INTERLEAVED_WITHOUT))
+_WITHOUT_MASTERS = (
+    "maze/hrl/interleaved",
+    *(row.name for row in INTERLEAVED_WITHOUT_MASTERS if "/maze/" in row.name),
+)
 # What :func:`comparisons` reads.
 COMPARED: tuple[str, ...] = tuple(
     dict.fromkeys(
@@ -202,6 +217,8 @@ COMPARED: tuple[str, ...] = tuple(
             *(row for grid in _COMPARED_GRIDS for row in grid.points().values()),
             *_ANNEALED,
             *_ANNEALED_MASTERS,
+            *_WITHOUT,
+            *_WITHOUT_MASTERS,
             _WITH_BONUS,
             *_OF_ANTS,
         )

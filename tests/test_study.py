@@ -859,6 +859,8 @@ def test_the_readme_shows_the_tables_of_the_report(monkeypatch):
     changed = readme_tables.with_tables(readme, re.sub(r"\d seeds", "77 seeds", said).replace("| plain |", "| bare |"))
     assert "77 seeds" in changed
     assert "| bare |" in changed
+    assert "| light/plain |" in said
+    assert "| light/plain |" not in changed  # the README shows the default ant's
 
 
 def write_switching(study, row, seed, idle, upside_down):

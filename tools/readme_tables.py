@@ -6,24 +6,29 @@ python tools/readme_tables.py
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-COPIED = {  # heading of the README: heading of the report
-    "## One real result": "## Side by side",
-    "## The study so far": "## Claims",
+
+def _has_runs(claim: str) -> bool:
+    return any(" seed" in cell for cell in claim.split("|")[3:])
+
+
+def _is_of_the_default_ant(line: str) -> bool:
+    return "/" not in line.split("|")[1]  # others stand under their address: light/plain
+
+
+COPIED = {  # heading of the README: heading of the report, and which lines of the table there
+    "## One real result": ("## Side by side", _is_of_the_default_ant),
+    "## The study so far": ("## Claims", _has_runs),
 }
 
 
 def with_tables(readme: str, report: str) -> str:
-    """The README with the report's tables: the first table under each heading, claims without runs left out."""
+    """The README with the report's tables: of the first table under each heading the lines that belong here."""
     lines = readme.splitlines(keepends=True)
-    for mine, theirs in COPIED.items():
+    for mine, (theirs, belongs) in COPIED.items():
         start, end = _table(lines, mine)
         head, body = _split(report.splitlines(keepends=True), theirs)
-        lines[start:end] = head + [line for line in body if theirs != "## Claims" or _has_runs(line)]
+        lines[start:end] = head + [line for line in body if belongs(line)]
     return "".join(lines)
-
-
-def _has_runs(claim: str) -> bool:
-    return any(" seed" in cell for cell in claim.split("|")[3:])
 
 
 def _split(lines: list[str], heading: str) -> tuple[list[str], list[str]]:

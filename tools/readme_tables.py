@@ -7,6 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
+
 def _has_runs(claim: str) -> bool:
     return any(" seed" in cell for cell in claim.split("|")[3:])
 

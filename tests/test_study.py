@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from footwork.study import (
     training_curves,
 )
 from footwork.study.experiments import (
+    ANTS,
     EXPERIMENTS,
     FLAT_GRIDS,
     GRIDS,
@@ -117,6 +119,17 @@ def test_a_plan_makes_what_a_run_stands_on_first_and_every_row_before_the_second
     assert len(plan.plan(study, ["walker/plain"], [], seeds=2)) == 2
     with pytest.raises(ValueError, match="seeds must be >= 1, got 0"):
         plan.plan(study, ["walker/plain"], [], seeds=0)
+
+
+def test_rows_that_a_claim_reads_get_ten_seeds_on_every_ant_of_the_table(study):
+    assert {name.partition("/")[0] for name in EXPERIMENTS} - {name.partition("/")[0] for name in MAIN} == {
+        "ablation",
+        *(ant.rstrip("/") for ant in ANTS if ant),
+    }
+    jobs = plan.plan(study, plan.default_rows(FULL, claims.rows_read()), claims.rows_read(ANTS))
+    seeds = Counter(job.row for job in jobs)
+    assert {seeds[row] for row in claims.rows_read(ANTS)} == {10}
+    assert {seeds["light/bandit/hrl/interleaved"], seeds["light/ablation/annealed/plain"]} == {3}
 
 
 def test_the_quick_study_is_short_and_has_every_row_of_a_claim(tmp_path):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from footwork.doors import tables
 from footwork.record import RunError
 from footwork.study.claims import rows_read
-from footwork.study.experiments import is_row, match_rows
+from footwork.study.experiments import ANTS, is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
 from footwork.study.judging import judge_all
 from footwork.study.plan import FULL, QUICK, Study, default_rows, mark, plan, read_mark
@@ -26,9 +26,8 @@ def reproduce(command: Reproduce) -> int:
     size = QUICK if command.quick else FULL
     ending = "-quick" if command.quick else ""
     study = Study(command.runs or Path(f"runs{ending}"), size)
-    read = rows_read()
-    rows = match_rows(command.rows) if command.rows else default_rows(size, read)
-    jobs = plan(study, rows, read, command.seeds)
+    rows = match_rows(command.rows) if command.rows else default_rows(size, rows_read())
+    jobs = plan(study, rows, rows_read(ANTS), command.seeds)
     if command.plan:
         tables.show(tables.plan_table(jobs, size.name))
         return 0

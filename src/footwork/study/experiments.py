@@ -337,6 +337,9 @@ EXPERIMENTS: dict[str, Experiment] = {
 }
 
 
+ANTS = ("", "light/")  # the ants whose rows stand in the table: what their addresses begin with
+
+
 def group_of(name: str) -> str:
     """What a row is listed under: all but the last part of its address."""
     return name.rpartition("/")[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -136,7 +137,7 @@ def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, .
 
 def _wrapped(words: str, width: int = 26) -> str:
     lines = [""]
-    for word in words.split():
+    for word in re.split(r"(?<!\d) ", words):  # a number stays with its unit
         lines = [*lines[:-1], f"{lines[-1]} {word}".strip()] if len(lines[-1]) + len(word) < width else [*lines, word]
     return "\n".join(lines)
 
@@ -182,7 +183,10 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
     for line, (title, names, metrics) in zip(axes, lines, strict=True):
         for ax, metric in zip(line, metrics, strict=True):
             _dots(ax, results, metric, list(dict.fromkeys(names)), named=ax is line[0])
-        line[0].set_title(title, loc="left")
+        line[0].set_title(" ")  # keeps the height for one that is wider than its panel
+        line[0].annotate(
+            title, (0, 1), (0, 6), xycoords="axes fraction", textcoords="offset points", fontsize=8
+        ).set_in_layout(False)
     return figure
 
 
@@ -243,7 +247,7 @@ def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) 
     ax.set_ylim(len(rows) - 0.5, -0.5)
     if METRICS[metric].is_share:
         ax.set_xlim(right=1.03)
-    ax.set_xlabel(_wrapped(METRICS[metric].words, 30), fontsize=7)
+    ax.set_xlabel(_wrapped(METRICS[metric].words, 28), fontsize=7)
 
 
 def masters_by_handovers(results: Results, rows: tuple[str, ...]) -> Any:

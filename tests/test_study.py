@@ -18,6 +18,7 @@ from footwork.doors.cli import run
 from footwork.evaluate import Episodes
 from footwork.learn.config import PAPER
 from footwork.record import RunDir, RunError, read_metrics
+from footwork.regularisers import Interleaved
 from footwork.statistics import Effect, iqm
 from footwork.study import (
     answers,
@@ -630,21 +631,25 @@ def test_shown_comparisons_do_not_decide_and_rows_of_ablations_do_not_ask_for_te
 
 
 def test_each_part_of_interleaving_is_left_out_alone():
-    whole, master = find_row("walker/interleaved"), find_row("maze/hrl/interleaved")
-    restored = {
-        "cooperation": lambda row: replace(row, regulariser=whole.regulariser),
-        "annealing": lambda row: replace(row, ppo=whole.ppo),
-        "ends-on-the-back": lambda row: replace(row, task=whole.task),
+    whole, plain = find_row("walker/interleaved"), find_row("walker/plain")
+    lost = {
+        "cooperation": {"regulariser": Interleaved(cooperative=False)},
+        "annealing": {"ppo": PAPER},
+        "ends-on-the-back": {"task": plain.task},
     }
-    assert [row.name.rpartition("/")[2] for row in INTERLEAVED_WITHOUT] == list(restored)
+    lost["all-three"] = {field: value for part in lost.values() for field, value in part.items()}
+    assert [row.name.rpartition("/")[2] for row in INTERLEAVED_WITHOUT] == list(lost)
     for row in INTERLEAVED_WITHOUT:
         part = row.name.rpartition("/")[2]
-        assert replace(row, name=whole.name) != whole
-        assert restored[part](replace(row, name=whole.name)) == whole
-        on_it = find_row(f"ablation/maze/hrl-interleaved-without/{part}")
-        assert on_it.needs == row.name
-        assert replace(on_it, name=master.name, sub_policies=whole.name) == master
-    assert find_row("ablation/interleaved-without/annealing").ppo == PAPER
+        assert row == replace(whole, name=row.name, **lost[part])
+        assert all(getattr(row, field) != getattr(whole, field) for field in lost[part])
+        for place in ("bandit", "maze"):
+            master, on_it = (
+                find_row(f"{place}/hrl/interleaved"),
+                find_row(f"ablation/{place}/hrl-interleaved-without/{part}"),
+            )
+            assert on_it == replace(master, name=on_it.name, sub_policies=row.name)
+    assert replace(row, name=plain.name, regulariser=None) == plain  # nothing is left but the exchange
 
 
 def test_the_light_ants_sub_policies_get_no_bonus():

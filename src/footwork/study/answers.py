@@ -298,8 +298,8 @@ ANSWERS: tuple[Answer, ...] = (
             ),
         ),
         built="interleaved rows hand ants over to each other while they train, count what an ant is then worth "
-        "to the others (cooperation), are annealed, and end episodes on the back: each of the last three is left "
-        "out once",
+        "to the others (cooperation), are annealed, and end episodes on the back: the last three are left out one by "
+        "one, and all together",
     ),
 )
 

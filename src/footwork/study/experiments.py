@@ -245,7 +245,7 @@ FLAT_GRIDS: dict[str, str] = {
 }
 GRIDS_BY_NAME: dict[str, Grid] = {grid.name: grid for grid in GRIDS}
 
-# What interleaved rows have besides their regulariser: annealing. The paper's rows with it, to tell the two apart.
+# Annealing is one of the things that interleaved rows have besides their regulariser. The paper's rows with it.
 ANNEALED: tuple[Experiment, ...] = tuple(
     replace(
         row,
@@ -257,14 +257,16 @@ ANNEALED: tuple[Experiment, ...] = tuple(
     )
     for row in WALKERS[:4]
 )
-# What makes interleaved ones what they are: each of its parts taken away.
+# What makes interleaved ones what they are: each of their parts taken away, and all but the exchange of ants.
 _INTERLEAVED = MAIN["walker/interleaved"]
+_UNCOOPERATIVE = _with_field(_INTERLEAVED, "regulariser.cooperative", False)
 INTERLEAVED_WITHOUT: tuple[Experiment, ...] = tuple(
     replace(row, name=f"ablation/interleaved-without/{part}")
     for part, row in {
-        "cooperation": _with_field(_INTERLEAVED, "regulariser.cooperative", False),
+        "cooperation": _UNCOOPERATIVE,
         "annealing": replace(_INTERLEAVED, ppo=PAPER),
         "ends-on-the-back": replace(_INTERLEAVED, task=ANT_WALKER),
+        "all-three": replace(_UNCOOPERATIVE, ppo=PAPER, task=ANT_WALKER),
     }.items()
 )
 

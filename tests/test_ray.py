@@ -36,7 +36,7 @@ def test_a_lost_node_loses_no_run_and_changes_no_number(tmp_path, monkeypatch):
         "PYTHONPATH", os.pathsep.join(map(str, [*_sources(), *os.environ.get("PYTHONPATH", "").split(":")]))
     )
     local, shared = Study(tmp_path / "local", SMALL), Study(tmp_path / "shared", SMALL)
-    jobs = plan(local, ROWS, [], seeds=2)
+    jobs = plan(local, ROWS, seeds=2)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     lost = cluster.add_node(num_cpus=1)
     try:
@@ -75,4 +75,4 @@ def _remove_when_busy(cluster, node, study, jobs):
 def test_an_address_that_does_not_answer_is_named(tmp_path):
     study = Study(tmp_path, SMALL)
     with pytest.raises(ValueError, match=r"no Ray cluster answers at '127\.0\.0\.1:1'"):
-        sweep.run_study(study, plan(study, ["walker/symmetric"], []), launcher="ray", address="127.0.0.1:1")
+        sweep.run_study(study, plan(study, ["walker/symmetric"]), launcher="ray", address="127.0.0.1:1")

@@ -105,21 +105,22 @@ def test_patterns_mean_rows():
 
 
 def test_a_plan_makes_what_a_run_stands_on_first_and_every_row_before_the_second_seed(study):
-    jobs = plan.plan(study, ["maze/hrl/appropriate-bias", "walker/symmetric"], ["maze/hrl/appropriate-bias"])
+    few = "ablation/walker/bonus/0.0"
+    jobs = plan.plan(study, ["maze/hrl/appropriate-bias", few])
     first = [job.row for job in jobs if job.seed == 0]
-    assert first == ["walker/plain", "walker/appropriate-bias", "maze/hrl/appropriate-bias", "walker/symmetric"]
+    assert first == ["walker/plain", "walker/appropriate-bias", "maze/hrl/appropriate-bias", few]
     assert [job.seed for job in jobs] == sorted(job.seed for job in jobs)
     seeds = {row: sum(job.row == row for job in jobs) for row in first}
     assert seeds == {
         "walker/plain": 10,
         "walker/appropriate-bias": 10,
         "maze/hrl/appropriate-bias": 10,
-        "walker/symmetric": 3,
+        few: 3,
     }
     assert {job.steps for job in jobs if job.row == "walker/plain"} == {4 * 1_998_848}
-    assert len(plan.plan(study, ["walker/plain"], [], seeds=2)) == 2
+    assert len(plan.plan(study, ["walker/plain"], seeds=2)) == 2
     with pytest.raises(ValueError, match="seeds must be >= 1, got 0"):
-        plan.plan(study, ["walker/plain"], [], seeds=0)
+        plan.plan(study, ["walker/plain"], seeds=0)
 
 
 def test_rows_that_a_claim_reads_get_ten_seeds_on_every_ant_of_the_table(study):
@@ -127,17 +128,17 @@ def test_rows_that_a_claim_reads_get_ten_seeds_on_every_ant_of_the_table(study):
         "ablation",
         *(ant.rstrip("/") for ant in ANTS if ant),
     }
-    jobs = plan.plan(study, plan.default_rows(FULL, claims.rows_read()), claims.rows_read(ANTS))
-    seeds = Counter(job.row for job in jobs)
+    seeds = Counter(job.row for job in plan.plan(study))
     assert {seeds[row] for row in claims.rows_read(ANTS)} == {10}
     assert {seeds["light/bandit/hrl/interleaved"], seeds["light/ablation/annealed/plain"]} == {3}
 
 
 def test_the_quick_study_is_short_and_has_every_row_of_a_claim(tmp_path):
     quick = Study(tmp_path, QUICK)
-    rows = plan.default_rows(QUICK, claims.rows_read())
-    assert set(claims.rows_read()) <= set(rows)
-    assert max(job.steps for job in plan.plan(quick, rows, claims.rows_read())) < 200_000
+    jobs = plan.plan(quick)
+    assert set(claims.rows_read()) <= {job.row for job in jobs}
+    assert [job.row for job in jobs if job.row.startswith("light/")] == ["light/walker/plain"] * QUICK.seeds
+    assert max(job.steps for job in jobs) < 200_000
     annealed = quick.row("walker/interleaved")
     assert annealed.ppo.anneal_updates * annealed.ppo.batch_size == annealed.total_steps
 

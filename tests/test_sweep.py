@@ -57,7 +57,7 @@ class Stage:
 
     def __init__(self, path):
         self.study, self.shelf, self.started_at = Study(path / "runs"), path / "shelf", path / "started.log"
-        self.jobs = plan(self.study, ROWS, [], seeds=2)
+        self.jobs = plan(self.study, ROWS, seeds=2)
         for one in self.jobs:
             fake_run(Study(self.shelf), one.row, one.seed, lines=10)
 
@@ -130,7 +130,7 @@ class Again(Stage):
     def reuse(self, path):
         from test_sweep import ROWS, Study, plan
         self.study, self.shelf, self.started_at = Study(path / "runs"), path / "shelf", path / "started.log"
-        self.jobs = plan(self.study, ROWS, [], seeds=2)
+        self.jobs = plan(self.study, ROWS, seeds=2)
 stage = Again(Path({path!r}))
 sweep.job_command, sweep.POLL = stage.command, 0.01
 stage.run(workers=2)

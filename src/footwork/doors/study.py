@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 from footwork.doors import tables
 from footwork.record import RunError
-from footwork.study.claims import rows_read
-from footwork.study.experiments import ANTS, is_row, match_rows
+from footwork.study.experiments import is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
 from footwork.study.judging import judge_all
-from footwork.study.plan import FULL, QUICK, Study, default_rows, mark, plan, read_mark
+from footwork.study.plan import FULL, QUICK, Study, mark, plan, read_mark
 from footwork.study.report import write_report
 from footwork.study.report_files import check_place
 from footwork.study.results import Results, all_rows, strays
@@ -26,8 +25,7 @@ def reproduce(command: Reproduce) -> int:
     size = QUICK if command.quick else FULL
     ending = "-quick" if command.quick else ""
     study = Study(command.runs or Path(f"runs{ending}"), size)
-    rows = match_rows(command.rows) if command.rows else default_rows(size, rows_read())
-    jobs = plan(study, rows, rows_read(ANTS), command.seeds)
+    jobs = plan(study, match_rows(command.rows) if command.rows else (), command.seeds)
     if command.plan:
         tables.show(tables.plan_table(jobs, size.name))
         return 0

@@ -11,7 +11,7 @@ import contextlib
 import json
 import os
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ import footwork
 from footwork import checkpoint
 from footwork.evaluate import SWITCHING_PERIODS
 from footwork.record import RunError
-from footwork.study.experiments import GRIDS, find_row, match_rows
+from footwork.study.claims import rows_read
+from footwork.study.experiments import ANTS, GRIDS, find_row, match_rows
 from footwork.train import Experiment, planned_steps
 
 STUDY_FILE = "study.json"
@@ -103,23 +104,23 @@ def _shortened(row: Experiment, most: tuple[int, int, int, int]) -> Experiment:
     return replace(row, total_steps=steps, ppo=replace(row.ppo, anneal_updates=anneal))
 
 
-def default_rows(size: Size, read_by_claims: Sequence[str]) -> list[str]:
-    """All rows; of a short study those that a claim reads, and the ends of each grid."""
+def default_rows(size: Size) -> list[str]:
+    """All rows; of a short study those of the default ant that a claim reads, and the ends of each grid."""
     if size.short is None:
         return match_rows(())
     ends = [f"{grid.name}/{value}" for grid in GRIDS for value in dict.fromkeys((grid.values[0], grid.values[-1]))]
-    return [*read_by_claims, *ends, "light/walker/plain"]
+    return [*rows_read(), *ends, "light/walker/plain"]
 
 
-def plan(study: Study, rows: Iterable[str], read_by_claims: Sequence[str], seeds: int | None = None) -> list[Job]:
+def plan(study: Study, rows: Iterable[str] = (), seeds: int | None = None) -> list[Job]:
     """The runs of some rows and of all that they stand on, in an order in which they can be made.
 
-    First seed 0 of every row, then seed 1: a study that is stopped early has every row.
+    First seed 0 of every row, then seed 1: a study that is stopped early has every row. A row that a claim reads, of
+    whichever ant of the table, gets the study's full number of seeds.
 
     Args:
         study: whose folder and size.
-        rows: addresses.
-        read_by_claims: rows that get the full number of seeds.
+        rows: addresses; none for :func:`default_rows`.
         seeds: of every row, in place of the size's own numbers.
 
     Raises:
@@ -128,8 +129,9 @@ def plan(study: Study, rows: Iterable[str], read_by_claims: Sequence[str], seeds
     if seeds is not None and seeds < 1:
         raise ValueError(f"seeds must be >= 1, got {seeds}")
     wanted: dict[str, int] = {}
-    for row in rows:
-        count = seeds or (study.size.seeds if row in read_by_claims else study.size.other_seeds)
+    read = set(rows_read(ANTS))
+    for row in tuple(rows) or default_rows(study.size):
+        count = seeds or (study.size.seeds if row in read else study.size.other_seeds)
         for name in _with_needed(study, row):
             wanted[name] = max(count, wanted.get(name, 0))
     ordered = list(dict.fromkeys(name for row in wanted for name in _with_needed(study, row)))

@@ -18,12 +18,12 @@ from footwork.evaluate import HANDOVER_AFTER, HANDOVER_SPEED, HANDOVER_STEPS, ID
 from footwork.record import source_digest
 from footwork.study.answers import ANSWERS, choices, said
 from footwork.study.claims import CLAIMS, Claim, rows_read
-from footwork.study.experiments import ANTS, SCHEDULES, find_row, in_braces
+from footwork.study.experiments import SCHEDULES, find_row, in_braces
 from footwork.study.figures import FIGURES, Drawn, count_in_words, draw_figures
 from footwork.study.judging import Finding, Judgement, judge_all, no_room, show_bound, show_chance, show_effect
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import Block, Bullets, Code, Heading, Picture, TableBlock, Text, markdown, page
-from footwork.study.plan import default_rows, plan, read_machine
+from footwork.study.plan import plan, read_machine
 from footwork.study.report_files import RESULTS, check_place, export
 from footwork.study.results import Results, all_rows, prefixes_at_hand, seeds_in_words
 from footwork.study.row_tables import side_by_side, side_by_side_caption, sub_policies, task_policies
@@ -294,7 +294,7 @@ def _left_out(results: Results, drawn: Sequence[Drawn]) -> list[Block]:
     missing = list(dict.fromkeys(row for d in drawn for row in d.without))
     planned: dict[str, int] = {}
     read = rows_read(prefixes_at_hand(results))
-    for job in plan(results.study, default_rows(results.study.size, rows_read()), rows_read(ANTS)):
+    for job in plan(results.study):
         planned[job.row] = planned.get(job.row, 0) + 1
     missing += [row for row in (*planned, *read) if row not in missing and not results.samples(row)]
     few = {row: len(results.samples(row)) for row in planned if 0 < len(results.samples(row)) < planned[row]}

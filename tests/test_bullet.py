@@ -5,6 +5,7 @@ Needs the extra footwork[bullet]; the contract needs pybullet_envs_gymnasium too
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from dataclasses import replace
@@ -465,31 +466,99 @@ def test_every_task_trains_on_it(tmp_path):
         env.physics.close()
 
 
-def test_a_run_is_kept_apart_and_cannot_be_resumed(tmp_path, monkeypatch):
-    experiment = with_engine(tiny("walker/symmetric", 3), "bullet")
-    monkeypatch.setitem(EXPERIMENTS, "walker/symmetric", with_engine(experiment, "mujoco"))
-    real, steps = training.iterate, []
+def stop_in(iteration, monkeypatch):
+    """Ctrl-C in the iteration of that number."""
+    real, begun = training.iterate, []
 
     def interrupted(*arguments):
-        steps.append(1)
-        if len(steps) == 2:
+        begun.append(1)
+        if len(begun) == iteration:
             os.kill(os.getpid(), signal.SIGINT)
         return real(*arguments)
 
     monkeypatch.setattr(training, "iterate", interrupted)
-    with pytest.raises(Interrupted, match=r"stopped at step 24 of 36; .* but engine bullet cannot resume"):
-        train_row(experiment, (0,), tmp_path, num_threads=1)
-    run = RunDir(tmp_path / "bullet/walker/symmetric/seed-0")
-    before = read_metrics(run.metrics_path)
-    assert run.latest_checkpoint().step == 24  # the policy is not lost
-    with pytest.raises(ValueError, match="PyBullet does not give out the whole state of its solver"):
-        train_row(experiment, (0,), tmp_path, resume=True, num_threads=1)
-    assert read_metrics(run.metrics_path) == before
-    done = train_row(experiment, (0,), tmp_path, "again", num_threads=1)
+
+
+def test_a_run_is_kept_apart(tmp_path, monkeypatch):
+    experiment = with_engine(tiny("walker/symmetric", 2), "bullet")
+    monkeypatch.setitem(EXPERIMENTS, "walker/symmetric", with_engine(experiment, "mujoco"))
+    done = train_row(experiment, (0,), tmp_path, num_threads=1)
     assert find_trained("bullet/walker/symmetric", tmp_path).source == done.source
     with pytest.raises(RunError, match="no finished run of walker/symmetric"):
         find_trained("walker/symmetric", tmp_path)
-    assert train_row(experiment, (0,), tmp_path, "again", resume=True).source == done.source  # it is finished
+    assert train_row(experiment, (0,), tmp_path, resume=True).source == done.source  # it is finished
+
+
+def test_going_on_from_a_snapshot_is_going_on_from_it_later(bullet):
+    (physics, state), (other, elsewhere) = bullet(3), bullet(3, 2)
+    state, elsewhere = drive(physics, state, 60)[-1], drive(other, elsewhere, 7)[-1]
+    assert state.foot_contact.any()
+    spoilt = np.zeros((3, 8))
+    spoilt[1, 2] = np.inf
+    state = physics.step(state, spoilt)
+    taken = physics.snapshot()
+    other.restore(taken)
+    assert taken["failed"].tolist() == [False, True, False]
+    for one, two in zip(drive(physics, state, 30), drive(other, elsewhere, 30), strict=True):
+        assert_same(one, two)
+    healed, healed_too = (place(p, s, pose(num_envs=3)) for p, s in ((physics, state), (other, elsewhere)))
+    assert_same(drive(physics, healed, 10)[-1], drive(other, healed_too, 10)[-1])
+
+
+def test_a_snapshot_leaves_the_ants_where_they_are(bullet):
+    physics, state = bullet()
+    state = drive(physics, state, 60)[-1]
+    before = physics.read(state.engine, np.float64)
+    taken = physics.snapshot()
+    after = physics.read(state.engine, np.float64)
+    np.testing.assert_array_equal(taken["qpos"], before.qpos)
+    np.testing.assert_allclose(after.qpos, before.qpos, atol=1e-12)
+    np.testing.assert_allclose(after.qvel, before.qvel, atol=1e-9)
+    np.testing.assert_array_equal(after.foot_contact, before.foot_contact)
+
+
+@pytest.mark.parametrize("row", ["walker/interleaved", "walker/appropriate-bias"])
+def test_a_run_that_was_stopped_goes_on_bit_for_bit_from_where_all_are_saved(tmp_path, monkeypatch, row):
+    experiment = with_engine(tiny(row), "bullet")
+    experiment = replace(  # long enough to come down and struggle
+        experiment,
+        task=replace(experiment.task, episode_steps=200),
+        ppo=replace(experiment.ppo, num_steps=24),
+        total_steps=5 * 96,
+    )
+    needed = {"needed": untrained("walker/plain")} if experiment.needs else {}
+    monkeypatch.setattr(training, "SNAPSHOT_STEPS", 2 * 4 * training.steps_per_iteration(experiment))  # 2 iterations
+    ends = []
+    for stopped_in in (None, 1, 3):
+        run = RunDir.create(tmp_path / f"{stopped_in}", {})
+        with monkeypatch.context() as patch, contextlib.ExitStack() as expect:
+            if stopped_in:
+                stop_in(stopped_in, patch)
+                said = {1: "nothing is saved in .* yet", 3: "saved at step 192 in .*"}[stopped_in]
+                expect.enter_context(pytest.raises(Interrupted, match=f"of 480; {said}, go on with --resume"))
+            training.train(experiment, (0,), run, num_threads=1, checkpoint_seconds=0.0, **needed)
+        policies = training.train(experiment, (0,), run, num_threads=2, **needed)
+        lines = [
+            {k: v for k, v in line.items() if not k.startswith("time/")} for line in read_metrics(run.metrics_path)
+        ]
+        ends.append((policies.params, lines))
+    for params, lines in ends[1:]:
+        jax.tree.map(np.testing.assert_array_equal, params, ends[0][0])
+        np.testing.assert_equal(lines, ends[0][1])
+
+
+def test_a_run_that_sees_the_ant_as_the_original_does_cannot_be_resumed(tmp_path, monkeypatch):
+    experiment = with_engine(tiny("walker/symmetric", 3), "bullet-original")
+    with monkeypatch.context() as patch:
+        stop_in(2, patch)
+        with pytest.raises(Interrupted, match=r"stopped at step 24 of 36; .* but engine bullet-original cannot resume"):
+            train_row(experiment, (0,), tmp_path, "run", num_threads=1)
+    run = RunDir(tmp_path / "bullet-original/walker/symmetric/run")
+    before = read_metrics(run.metrics_path)
+    assert run.latest_checkpoint().step == 24  # the policy is not lost
+    with pytest.raises(ValueError, match="engine bullet-original tells of the ant what AntBulletEnv tells"):
+        train_row(experiment, (0,), tmp_path, "run", resume=True, num_threads=1)
+    assert read_metrics(run.metrics_path) == before
 
 
 def test_the_same_seed_gives_the_same_numbers_on_any_number_of_workers(tmp_path):

@@ -39,6 +39,7 @@ from footwork.regularisers import (
 from footwork.tasks.task import Task
 from footwork.types import Key, Metrics, Params, Transition
 
+SNAPSHOT_STEPS = 131_072  # control steps of all learners between checkpoints, where taking one changes numbers
 COMPILER_OPTIONS = {"xla_cpu_multi_thread_eigen": False}  # a product's result must not depend on the thread count
 
 
@@ -290,12 +291,13 @@ def train(
         run: an existing run directory, locked by the caller.
         needed: the policies of ``experiment.needs``.
         num_threads: of the physics; changes no number.
-        checkpoint_seconds: time between checkpoints; changes no number.
+        checkpoint_seconds: time between checkpoints; changes no number. Not heeded on an engine whose ants feel a
+            snapshot (``Physics.snapshot_alters``): there a checkpoint comes every :data:`SNAPSHOT_STEPS`.
         tensorboard: also write event files (extra ``[tb]``).
 
     Raises:
         TrainingDiverged: a metric of the learner is not finite; names it, the step and the last checkpoint.
-        Interrupted: SIGINT or SIGTERM came; the state is saved.
+        Interrupted: SIGINT or SIGTERM came; the state is saved, or was at the last checkpoint.
         ValueError: the run is beyond ``experiment.total_steps`` already, or has a checkpoint that its engine
             cannot go on from.
     """
@@ -306,7 +308,8 @@ def train(
         _check_not_beyond(experiment, run, learning)
         learning = _learn(experiment, env, learning, seeds, run, compiling, checkpoint_seconds, tensorboard)
         total = planned_steps(experiment)
-        _save(run, env, learning, total)
+        if not env.physics.snapshot_alters:
+            _save(run, env, learning, total)
     return _finish(experiment, seeds, run, learning, total)
 
 
@@ -329,6 +332,7 @@ def _learn(
 ) -> Learning:
     """Iterate to the last planned step: what was learned. Logs every iteration, saves now and then and when stopped."""
     per_iteration, total = steps_per_iteration(experiment), planned_steps(experiment)
+    all_per_iteration = len(seeds) * experiment.runs_per_seed * per_iteration
     step, last_save = learning.iteration * per_iteration, time.monotonic()
     with (
         run.open_metrics(tensorboard) as log,
@@ -341,19 +345,28 @@ def _learn(
             step = learning.iteration * per_iteration
             metrics = jax.tree.map(np.asarray, metrics)
             _check_finite({**metrics, "parameters": _largest(learning.learners.params)}, step, run)
-            rate = len(seeds) * experiment.runs_per_seed * per_iteration / (time.monotonic() - begun)
+            rate = all_per_iteration / (time.monotonic() - begun)
             log.write(step, {**metrics, "time/steps_per_second": rate})
             progress.update(step, _headline(experiment, metrics))
-            if stop_asked() or time.monotonic() - last_save > checkpoint_seconds:
+            if env.physics.snapshot_alters:
+                due = learning.iteration % max(1, SNAPSHOT_STEPS // all_per_iteration) == 0
+            else:
+                due = stop_asked() or time.monotonic() - last_save > checkpoint_seconds
+            if due:
                 _save(run, env, learning, step)
                 last_save = time.monotonic()
             if stop_asked():
-                raise Interrupted(f"stopped at step {step} of {total}; saved in {run.path}, {_way_on(experiment, env)}")
+                raise Interrupted(f"stopped at step {step} of {total}; {_way_on(experiment, env, run)}")
     return learning
 
 
-def _way_on(experiment: Experiment, env: Environment) -> str:
-    return "go on with --resume" if env.physics.resumable else f"but engine {experiment.engine} cannot resume"
+def _way_on(experiment: Experiment, env: Environment, run: RunDir) -> str:
+    """What a run that was stopped has saved, and how it goes on."""
+    saved = [step for step, _ in run.checkpoints()]
+    where = f"saved at step {saved[-1]} in {run.path}" if saved else f"nothing is saved in {run.path} yet"
+    return f"{where}, " + (
+        "go on with --resume" if env.physics.resumable else f"but engine {experiment.engine} cannot resume"
+    )
 
 
 def _finish(experiment: Experiment, seeds: tuple[int, ...], run: RunDir, learning: Learning, step: int) -> Trained:

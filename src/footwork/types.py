@@ -53,6 +53,7 @@ class Physics(Protocol):
 
     traceable: bool  # may be called inside jit (MJX), or only from the host (C engines)
     resumable: bool  # snapshot() holds all there is: a run can go on bit for bit
+    snapshot_alters: bool  # the ants feel a snapshot(): runs that are to be equal take it at equal steps
     control_dt: float  # seconds per control step
     num_envs: int
 
@@ -75,7 +76,10 @@ class Physics(Protocol):
         """Advance one control step; rows outside ``active`` are held and cost nothing."""
 
     def snapshot(self) -> dict[str, Any]:
-        """The engine's whole hidden state as named arrays (empty where all of it is in PhysicsState)."""
+        """The engine's whole hidden state as named arrays (empty where all of it is in PhysicsState).
+
+        Going on from here is the same as going on from :meth:`restore`.
+        """
 
     def restore(self, arrays: dict[str, Any]) -> None:
         """Continue, bit for bit, from what :meth:`snapshot` returned.

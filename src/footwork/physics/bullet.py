@@ -36,9 +36,10 @@ SUBSTEPS, SOLVER_ITERATIONS, CONTACT_ERP = 4, 5, 0.9
 GROUND = {"lateralFriction": 0.8, "restitution": 0.5}  # times the ant's own friction of 1.5
 
 CANNOT_RESUME = (
-    "PyBullet does not give out the whole state of its solver, so a run on it cannot go on bit for bit; "
-    "train it anew under another --name"
+    "engine bullet-original tells of the ant what AntBulletEnv tells, which is not where it is, so a run on it cannot "
+    "go on bit for bit; train it anew under another --name"
 )
+_SNAPSHOT = ("qpos", "qvel", "touching", "failed")  # of _Shared
 _NOT_ITS_OWN = ("name", "reset_height", "reset_ankle_deg", "reset_joint_noise", "fall_height")  # the task's, of a Robot
 
 
@@ -51,6 +52,10 @@ class BulletPhysics:
     ant passes through itself (``conaffinity="0"`` in its ant.xml). A world that comes to hold
     a number that float32 cannot, or is given one, is reported in ``diverged`` and is not
     stepped until it is reset.
+
+    PyBullet keeps its solver's memory of contacts to itself. So a snapshot forgets it, too: it puts
+    every ant down anew, where it is and as fast as it is, and whoever goes on from the snapshot
+    later does what who took it does.
 
     Args:
         robot: must be PyBullet's ant as far as physics goes: masses, torques, limits and friction
@@ -68,7 +73,6 @@ class BulletPhysics:
     """
 
     traceable = False
-    resumable = False
 
     def __init__(
         self, robot: Robot, arena: Arena, num_envs: int, num_workers: int = 0, *, original_env: bool = False
@@ -82,6 +86,7 @@ class BulletPhysics:
         _check_room(num_envs, num_workers)
         self.control_dt = robot.control_dt
         self.num_envs = num_envs
+        self.resumable = self.snapshot_alters = not original_env  # which reports what is not the state
         self._reset_height = robot.reset_height
         with tempfile.TemporaryFile() as file:
             file.truncate(_Shared.size(num_envs))
@@ -127,12 +132,25 @@ class BulletPhysics:
         return self.read(simulation)
 
     def snapshot(self) -> dict[str, Any]:
-        """Nothing: see :data:`CANNOT_RESUME`."""
-        return {}
+        """Where all ants are, in float64, contacts and failures; nothing with ``original_env``."""
+        if not self.resumable:
+            return {}
+        arrays = {name: getattr(self._shared, name).copy() for name in _SNAPSHOT}
+        self.restore(arrays)
+        return arrays
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        """Refused."""
-        raise ValueError(CANNOT_RESUME)
+        """Put all ants where they were; refused with ``original_env``.
+
+        Raises:
+            ValueError: :data:`CANNOT_RESUME`.
+        """
+        if not self.resumable:
+            raise ValueError(CANNOT_RESUME)
+        for name in _SNAPSHOT:
+            getattr(self._shared, name)[:] = arrays[name]
+        self._command(b"i", np.flatnonzero(~self._shared.failed))
+        self._shared.touching[:] = arrays["touching"]  # for the ants it is the step before that counts
 
     def close(self) -> None:
         """End the worker processes."""

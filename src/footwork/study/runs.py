@@ -84,7 +84,7 @@ def train_row(
     is; a larger ``total_steps`` than it was finished with is trained on to.
 
     Raises:
-        ValueError: bad seeds, the run was begun with another config, or its engine cannot resume.
+        ValueError: bad seeds, the run was begun with another config, or its engine cannot resume (bullet-original).
         ImportError: its engine is not installed.
         RunError: the directory is in use, or occupied and not to be resumed.
         CheckpointError: a checkpoint is damaged, or the disk is full.

@@ -1,34 +1,43 @@
-"""Put the report's claims and its table side by side into the README, line by line.
+"""Put the report's verdicts and its table side by side into the README, line by line.
 
 python tools/readme_tables.py
 """
 
+import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
 
-def _has_runs(claim: str) -> bool:
-    return any(" seed" in cell for cell in claim.split("|")[3:])
+def _verdicts_alone(claim: str) -> str | None:
+    """A claim and what became of it, without the comparisons; None for one that has no runs."""
+    cells = claim.split("|")
+    if not any(" seed" in cell for cell in cells[3:]):
+        return None
+    # An engine or ant is named before its verdict, a comparison stands in a line of its own after it.
+    shown = [re.sub(r"<br>(?![^<]*\*\*)[^<]*", "", cell).rstrip() + " " for cell in cells[3:-1]]
+    return "|".join([*cells[:2], cells[2].replace("<br>", " "), *shown, cells[-1]])
 
 
-def _is_of_the_default_ant(line: str) -> bool:
-    return "/" not in line.split("|")[1]  # others stand under their address: light/plain
+def _of_the_default_ant(kind: str) -> str | None:
+    """The line of a kind of policies of the table's own; None for other ants (light/plain) and for ablations."""
+    name = kind.split("|")[1]
+    return None if "/" in name or "annealed" in name or "without" in name else kind
 
 
-COPIED = {  # heading of the README: heading of the report, and which lines of the table there
-    "## One real result": ("## Side by side", _is_of_the_default_ant),
-    "## The study so far": ("## Claims", _has_runs),
+COPIED = {  # heading of the README: heading of the report, and what the README says of each line of its table
+    "## One real result": ("## Side by side", _of_the_default_ant),
+    "## The study so far": ("## Claims", _verdicts_alone),
 }
 
 
 def with_tables(readme: str, report: str) -> str:
     """The README with the report's tables: of the first table under each heading the lines that belong here."""
     lines = readme.splitlines(keepends=True)
-    for mine, (theirs, belongs) in COPIED.items():
+    for mine, (theirs, told) in COPIED.items():
         start, end = _table(lines, mine)
         head, body = _split(report.splitlines(keepends=True), theirs)
-        lines[start:end] = head + [line for line in body if belongs(line)]
+        lines[start:end] = head + [line for line in map(told, body) if line is not None]
     return "".join(lines)
 
 

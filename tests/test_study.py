@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import shutil
@@ -46,7 +47,7 @@ from footwork.study.experiments import (
     is_row,
     match_rows,
 )
-from footwork.study.figures import FIGURES, draw_figures, find_figures, style
+from footwork.study.figures import FIGURES, draw_figures, find_figures, measures, style
 from footwork.study.metrics import METRICS
 from footwork.study.plan import FULL, QUICK, Study
 from footwork.train import planned_steps, steps_per_iteration
@@ -963,6 +964,19 @@ def test_figures_of_which_there_is_one_are_not_drawn_under_another_ant(study, tm
     fill(study, ("light/walker/plain", "light/maze/hrl/interleaved"), 1)
     drawn = draw_figures(results.Results(study), find_figures(["12", "13", "14", "20"]), tmp_path, "light/")
     assert [one.figure.name for one in drawn] == ["12-switching"]
+
+
+def test_a_way_that_was_lost_lies_within_its_panel(study):
+    fill(study, ("bandit/hrl/interleaved",), 2)
+    for k, seed in itertools.product((10, 400), (0, 1)):
+        path = fake_run(study, f"ablation/bandit/k/{k}", seed) / "evaluation.json"
+        content = json.loads(path.read_text())
+        content["by_seed"][0]["way"] = 0.9 if k == 10 else -1.4 - seed / 10
+        write(path, content)
+    panels = measures.k_grids(results.Results(study), ()).axes
+    (way,) = (ax for ax in panels if ax.get_title() == "bandit/k" and ax.dataLim.y0 < 0)
+    assert way.get_ylim()[0] < -1.5
+    assert way.get_ylim()[1] > 1.0
 
 
 def test_masters_are_set_beside_their_own_sub_policies(study):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -115,7 +116,7 @@ def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, .
     """A column per grid, a line of panels per metric."""
     figure, axes = panels(len(metrics), len(grids), height)
     for line, metric in zip(axes, metrics, strict=True):
-        highest = max((e.high for grid in grids for e in _points(results, grid, metric)[1]), default=1.0)
+        limits = _limits(METRICS[metric].is_share, [e for grid in grids for e in _points(results, grid, metric)[1]])
         for ax, grid in zip(line, grids, strict=True):
             values, effects = _points(results, grid, metric)
             x = values if all(isinstance(v, int | float) for v in values) else list(range(len(values)))
@@ -128,11 +129,19 @@ def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, .
             ax.minorticks_off()
             if not values:
                 empty(ax, "no finished\nruns yet")
-            ax.set_ylim((-0.05, 1.05) if METRICS[metric].is_share else (0.0, 1.1 * highest))
+            ax.set_ylim(limits)
             ax.set_title(grid.name.removeprefix("ablation/"))
             ax.set_xlabel(f"{grid.words};\nbelow: seeds")
         line[0].set_ylabel(_wrapped(METRICS[metric].words))
     return figure
+
+
+def _limits(is_share: bool, effects: Sequence[Effect]) -> tuple[float, float]:
+    """Of an axis with these points: from 0, all of it if they are shares, and below where a way was lost."""
+    low = min((e.low for e in effects), default=0.0)
+    high = 1.0 if is_share else max((e.high for e in effects), default=1.0)
+    margin = 0.05 * (high - min(low, 0.0))
+    return (min(low, 0.0) - margin if is_share or low < 0 else 0.0), high + margin
 
 
 def _wrapped(words: str, width: int = 26) -> str:
@@ -158,7 +167,7 @@ def k_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
     """What the length t of each regulariser does to sub-policies."""
-    return grid_panels(results, _grids("t"), ("handover", "speed"), 2.3)
+    return grid_panels(results, _grids("t"), ("handover", "moving", "speed"), 2.3)
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:

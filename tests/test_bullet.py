@@ -5,7 +5,7 @@ Needs the extra footwork[bullet]; the contract needs pybullet_envs_gymnasium too
 
 from __future__ import annotations
 
-import contextlib
+import json
 import os
 import signal
 from dataclasses import replace
@@ -489,62 +489,121 @@ def test_a_run_is_kept_apart(tmp_path, monkeypatch):
     assert train_row(experiment, (0,), tmp_path, resume=True).source == done.source  # it is finished
 
 
-def test_going_on_from_a_snapshot_is_going_on_from_it_later(bullet):
+def test_all_that_are_restored_from_a_snapshot_go_on_alike(bullet):
+    """The engine that it was taken from, the same after other things happened, and a new one."""
     (physics, state), (other, elsewhere) = bullet(3), bullet(3, 2)
-    state, elsewhere = drive(physics, state, 60)[-1], drive(other, elsewhere, 7)[-1]
+    state = drive(physics, state, 60)[-1]
     assert state.foot_contact.any()
     spoilt = np.zeros((3, 8))
     spoilt[1, 2] = np.inf
     state = physics.step(state, spoilt)
     taken = physics.snapshot()
-    other.restore(taken)
     assert taken["failed"].tolist() == [False, True, False]
-    for one, two in zip(drive(physics, state, 30), drive(other, elsewhere, 30), strict=True):
+    ways = []
+    for engine, now in ((physics, state), (physics, state), (other, elsewhere)):
+        engine.restore(taken)
+        on = drive(engine, now, 30)
+        ways.append([*on, place(engine, on[-1], pose(num_envs=3)), *drive(engine, on[-1], 10)])
+    for one, two, three in zip(*ways, strict=True):
         assert_same(one, two)
-    healed, healed_too = (place(p, s, pose(num_envs=3)) for p, s in ((physics, state), (other, elsewhere)))
-    assert_same(drive(physics, healed, 10)[-1], drive(other, healed_too, 10)[-1])
+        assert_same(one, three)
 
 
-def test_a_snapshot_leaves_the_ants_where_they_are(bullet):
-    physics, state = bullet()
-    state = drive(physics, state, 60)[-1]
-    before = physics.read(state.engine, np.float64)
+def test_a_restored_ant_has_forgotten_the_wall_it_leans_on(bullet):
+    """Where a link touches at several points, PyBullet's memory of them would decide what comes next."""
+    (physics, state), (other, elsewhere) = bullet(16, arena=MAZES["u"]), bullet(16, arena=MAZES["u"])
+    wall = MAZES["u"].walls[0]
+    start, speed = pose(num_envs=16), np.zeros((16, 14))
+    start[:, 0] = np.linspace(wall.x - wall.half_x, wall.x + wall.half_x, 16)
+    start[:, 1] = wall.y - wall.half_y - 1.2
+    speed[:, 1] = 4.0
+    state = place(physics, state, start, speed)
+    push = np.random.default_rng(7).uniform(-1, 1, (16, 8))
+    for _ in range(60):
+        state = physics.step(state, push)
+    physics.restore(taken := physics.snapshot())
+    other.restore(taken)
+    for _ in range(5):
+        state, elsewhere = physics.step(state, push), other.step(elsewhere, push)
+        assert_same(state, elsewhere)
+
+
+def test_a_snapshot_leaves_the_ants_alone_and_a_restored_ant_is_where_it_was(bullet):
+    (physics, state), (other, untouched) = bullet(), bullet()
+    state, untouched = drive(physics, state, 60)[-1], drive(other, untouched, 60)[-1]
     taken = physics.snapshot()
-    after = physics.read(state.engine, np.float64)
-    np.testing.assert_array_equal(taken["qpos"], before.qpos)
-    np.testing.assert_allclose(after.qpos, before.qpos, atol=1e-12)
-    np.testing.assert_allclose(after.qvel, before.qvel, atol=1e-9)
-    np.testing.assert_array_equal(after.foot_contact, before.foot_contact)
+    assert_same(drive(physics, state, 20)[-1], drive(other, untouched, 20)[-1])
+    physics.restore(taken)
+    now = physics.read(state.engine, np.float64)
+    np.testing.assert_allclose(now.qpos, taken["qpos"], atol=1e-12)
+    np.testing.assert_allclose(now.qvel, taken["qvel"], atol=1e-9)
+    np.testing.assert_array_equal(now.foot_contact, taken["touching"])
 
 
-@pytest.mark.parametrize("row", ["walker/interleaved", "walker/appropriate-bias"])
+def small(row, iterations):
+    """The row on PyBullet, a few updates that are long enough to come down and struggle."""
+    experiment = tiny(row.removeprefix("bullet/"))
+    ppo = replace(experiment.ppo, num_steps=24 if experiment.steps_per_decision == 1 else 12)
+    task = replace(experiment.task, episode_steps=200)
+    return with_engine(replace(experiment, ppo=ppo, task=task, total_steps=iterations * 96), "bullet")
+
+
+def left_by(run, policies):
+    """What a run leaves that must not depend on how it got there."""
+    lines = [{k: v for k, v in line.items() if not k.startswith("time/")} for line in read_metrics(run.metrics_path)]
+    return policies.params, lines
+
+
+def assert_left_the_same(one, other):
+    jax.tree.map(np.testing.assert_array_equal, one[0], other[0])
+    np.testing.assert_equal(one[1], other[1])
+
+
+@pytest.mark.parametrize("row", ["walker/appropriate-bias", "walker/interleaved", "bandit/hrl/plain", "maze/flat/free"])
 def test_a_run_that_was_stopped_goes_on_bit_for_bit_from_where_all_are_saved(tmp_path, monkeypatch, row):
-    experiment = with_engine(tiny(row), "bullet")
-    experiment = replace(  # long enough to come down and struggle
-        experiment,
-        task=replace(experiment.task, episode_steps=200),
-        ppo=replace(experiment.ppo, num_steps=24),
-        total_steps=5 * 96,
-    )
+    experiment = small(row, 5)
     needed = {"needed": untrained("walker/plain")} if experiment.needs else {}
-    monkeypatch.setattr(training, "SNAPSHOT_STEPS", 2 * 4 * training.steps_per_iteration(experiment))  # 2 iterations
-    ends = []
-    for stopped_in in (None, 1, 3):
+    monkeypatch.setattr(training, "SAVE_EVERY_STEPS", 2 * experiment.runs_per_seed * 96)
+    whole = RunDir.create(tmp_path / "whole", {})
+    expected = left_by(whole, training.train(experiment, (0,), whole, num_threads=1, checkpoint_seconds=0.0, **needed))
+    assert [step for step, _ in whole.checkpoints()] == [192, 384]
+    for stopped_in, saved in ((1, "nothing is saved in .* yet"), (3, "saved at step 192 in .*")):
         run = RunDir.create(tmp_path / f"{stopped_in}", {})
-        with monkeypatch.context() as patch, contextlib.ExitStack() as expect:
-            if stopped_in:
-                stop_in(stopped_in, patch)
-                said = {1: "nothing is saved in .* yet", 3: "saved at step 192 in .*"}[stopped_in]
-                expect.enter_context(pytest.raises(Interrupted, match=f"of 480; {said}, go on with --resume"))
-            training.train(experiment, (0,), run, num_threads=1, checkpoint_seconds=0.0, **needed)
-        policies = training.train(experiment, (0,), run, num_threads=2, **needed)
-        lines = [
-            {k: v for k, v in line.items() if not k.startswith("time/")} for line in read_metrics(run.metrics_path)
-        ]
-        ends.append((policies.params, lines))
-    for params, lines in ends[1:]:
-        jax.tree.map(np.testing.assert_array_equal, params, ends[0][0])
-        np.testing.assert_equal(lines, ends[0][1])
+        with monkeypatch.context() as patch:
+            stop_in(stopped_in, patch)
+            with pytest.raises(Interrupted, match=f"{saved}, go on with --resume"):
+                training.train(experiment, (0,), run, num_threads=1, checkpoint_seconds=0.0, **needed)
+        assert_left_the_same(left_by(run, training.train(experiment, (0,), run, num_threads=2, **needed)), expected)
+
+
+def test_a_finished_run_that_is_to_be_longer_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "SAVE_EVERY_STEPS", 2 * 96)
+    row, short, long = "walker/symmetric", small("walker/symmetric", 3), small("walker/symmetric", 5)
+    monkeypatch.setitem(EXPERIMENTS, row, with_engine(short, "mujoco"))
+    expected = train_row(long, (0,), tmp_path, "whole", num_threads=1)
+    run = RunDir(tmp_path / "bullet" / row / "parts")
+    train_row(short, (0,), tmp_path, "parts", num_threads=1)
+    with monkeypatch.context() as patch:
+        stop_in(1, patch)
+        with pytest.raises(Interrupted, match="saved at step 192"):
+            train_row(long, (0,), tmp_path, "parts", resume=True, num_threads=1)
+    assert not run.finished  # its metrics no longer reach the end that it had
+    done = train_row(long, (0,), tmp_path, "parts", resume=True, num_threads=1)
+    whole = RunDir(tmp_path / "bullet" / row / "whole")
+    assert_left_the_same(left_by(run, done), left_by(whole, expected))
+
+
+def test_a_run_of_another_pybullet_is_not_gone_on_with(tmp_path, monkeypatch):
+    experiment = with_engine(tiny("walker/symmetric", 2), "bullet")
+    train_row(experiment, (0,), tmp_path, "run", num_threads=1)
+    path = tmp_path / "bullet/walker/symmetric/run/config.json"
+    content = json.loads(path.read_text())
+    for then, said in (("3.2.6", "pybullet 3.2.6, this is"), (None, "pybullet of a version that was not recorded")):
+        content["versions"] |= {"pybullet": then}
+        content["versions"] = {name: value for name, value in content["versions"].items() if value}
+        path.write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=f"was begun with {said}"):
+            train_row(experiment, (0,), tmp_path, "run", resume=True)
 
 
 def test_a_run_that_sees_the_ant_as_the_original_does_cannot_be_resumed(tmp_path, monkeypatch):
@@ -556,7 +615,7 @@ def test_a_run_that_sees_the_ant_as_the_original_does_cannot_be_resumed(tmp_path
     run = RunDir(tmp_path / "bullet-original/walker/symmetric/run")
     before = read_metrics(run.metrics_path)
     assert run.latest_checkpoint().step == 24  # the policy is not lost
-    with pytest.raises(ValueError, match="engine bullet-original tells of the ant what AntBulletEnv tells"):
+    with pytest.raises(ValueError, match="no ant can be put back from that"):
         train_row(experiment, (0,), tmp_path, "run", resume=True, num_threads=1)
     assert read_metrics(run.metrics_path) == before
 

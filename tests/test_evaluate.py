@@ -33,7 +33,7 @@ class Glider:
 
     traceable = False
     resumable = True
-    snapshot_alters = False
+    restore_alters = False
     control_dt = DT
     seen: list[np.ndarray]  # every action, of the newest engine
 

@@ -36,7 +36,7 @@ class Hovercraft:
     """An engine without mechanics, for the host or for a device: the first actions push, and friction slows."""
 
     resumable = True
-    snapshot_alters = False
+    restore_alters = False
 
     def __init__(self, robot, arena, num_envs, traceable):
         self.traceable, self.num_envs, self.control_dt = traceable, num_envs, robot.control_dt

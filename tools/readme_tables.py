@@ -6,6 +6,8 @@ python tools/readme_tables.py
 import re
 from pathlib import Path
 
+from footwork.study.experiments import KINDS
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -15,18 +17,19 @@ def _verdicts_alone(claim: str) -> str | None:
     if not any(" seed" in cell for cell in cells[3:]):
         return None
     # An engine or ant is named before its verdict, a comparison stands in a line of its own after it.
+    words = re.sub(r" \([^()]*; shown too:[^()]*\)", "", cells[2].replace("<br>", " "))  # what a comparison is about
     shown = [re.sub(r"<br>(?![^<]*\*\*)[^<]*", "", cell).rstrip() + " " for cell in cells[3:-1]]
-    return "|".join([*cells[:2], cells[2].replace("<br>", " "), *shown, cells[-1]])
+    return "|".join([*cells[:2], words, *shown, cells[-1]])
 
 
-def _of_the_default_ant(kind: str) -> str | None:
-    """The line of a kind of policies of the table's own; None for other ants (light/plain) and for ablations."""
-    name = kind.split("|")[1]
-    return None if "/" in name or "annealed" in name or "without" in name else kind
+def _main_kind(line: str) -> str | None:
+    """The line of a kind of sub-policies or of flat policies; None for ablations and other ants."""
+    name = line.split("|")[1].strip()
+    return line if name in KINDS or name.startswith("flat policy") else None
 
 
 COPIED = {  # heading of the README: heading of the report, and what the README says of each line of its table
-    "## One real result": ("## Side by side", _of_the_default_ant),
+    "## One real result": ("## Side by side", _main_kind),
     "## The study so far": ("## Claims", _verdicts_alone),
 }
 
@@ -34,10 +37,10 @@ COPIED = {  # heading of the README: heading of the report, and what the README 
 def with_tables(readme: str, report: str) -> str:
     """The README with the report's tables: of the first table under each heading the lines that belong here."""
     lines = readme.splitlines(keepends=True)
-    for mine, (theirs, told) in COPIED.items():
+    for mine, (theirs, line_of) in COPIED.items():
         start, end = _table(lines, mine)
         head, body = _split(report.splitlines(keepends=True), theirs)
-        lines[start:end] = head + [line for line in map(told, body) if line is not None]
+        lines[start:end] = head + [line for line in map(line_of, body) if line is not None]
     return "".join(lines)
 
 

@@ -238,12 +238,14 @@ class RunDir:
     def rewind(self, step: int) -> None:
         """Forget what came after ``step``, as the first act of resuming from its checkpoint.
 
-        Later lines of metrics and half-written files of killed processes go; later checkpoints (damaged,
-        or they would have been resumed from) are renamed to ``.damaged``.
+        Later lines of metrics and half-written files of killed processes go, and DONE if it says that the run ended
+        later; later checkpoints (damaged, or they would have been resumed from) are renamed to ``.damaged``.
 
         Raises:
             RunError: the metrics cannot be read or cut.
         """
+        if self.finished and int(self.summary().get("steps", step)) > step:
+            (self.path / "DONE").unlink()  # it ended later than it goes on from: it is not finished any more
         truncate_metrics(self.metrics_path, step)
         late = [path for at, path in self.checkpoints() if at > step]
         torn = [path for place in (self.path, self.path / "checkpoints") for path in place.glob(".*.tmp")]
@@ -410,6 +412,9 @@ def versions() -> dict[str, str]:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
+    for name in ("pybullet", "mujoco-mjx"):  # extras: engines
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
     system = "-".join((platform.system(), platform.machine(), *filter(None, platform.libc_ver())))
     return {**found, "platform": system}
 

@@ -39,7 +39,7 @@ from footwork.regularisers import (
 from footwork.tasks.task import Task
 from footwork.types import Key, Metrics, Params, Transition
 
-SNAPSHOT_STEPS = 131_072  # control steps of all learners between checkpoints, where taking one changes numbers
+SAVE_EVERY_STEPS = 131_072  # control steps of all learners between checkpoints, where a checkpoint changes numbers
 COMPILER_OPTIONS = {"xla_cpu_multi_thread_eigen": False}  # a product's result must not depend on the thread count
 
 
@@ -149,7 +149,7 @@ class TrainingDiverged(RuntimeError):
 
 
 class Interrupted(RuntimeError):
-    """The run was asked to stop, and has saved itself."""
+    """The run was asked to stop, and has saved itself as far as its engine allows."""
 
 
 def choices_of(experiment: Experiment, needed: Trained | None) -> SubPolicies | None:
@@ -291,13 +291,13 @@ def train(
         run: an existing run directory, locked by the caller.
         needed: the policies of ``experiment.needs``.
         num_threads: of the physics; changes no number.
-        checkpoint_seconds: time between checkpoints; changes no number. Not heeded on an engine whose ants feel a
-            snapshot (``Physics.snapshot_alters``): there a checkpoint comes every :data:`SNAPSHOT_STEPS`.
+        checkpoint_seconds: time between checkpoints; changes no number. Not heeded on an engine whose ants feel it
+            (``Physics.restore_alters``): there a checkpoint comes every :data:`SAVE_EVERY_STEPS`, and only then.
         tensorboard: also write event files (extra ``[tb]``).
 
     Raises:
         TrainingDiverged: a metric of the learner is not finite; names it, the step and the last checkpoint.
-        Interrupted: SIGINT or SIGTERM came; the state is saved, or was at the last checkpoint.
+        Interrupted: SIGINT or SIGTERM came; says what is saved.
         ValueError: the run is beyond ``experiment.total_steps`` already, or has a checkpoint that its engine
             cannot go on from.
     """
@@ -308,7 +308,7 @@ def train(
         _check_not_beyond(experiment, run, learning)
         learning = _learn(experiment, env, learning, seeds, run, compiling, checkpoint_seconds, tensorboard)
         total = planned_steps(experiment)
-        if not env.physics.snapshot_alters:
+        if not env.physics.restore_alters:
             _save(run, env, learning, total)
     return _finish(experiment, seeds, run, learning, total)
 
@@ -330,7 +330,7 @@ def _learn(
     checkpoint_seconds: float,
     tensorboard: bool,
 ) -> Learning:
-    """Iterate to the last planned step: what was learned. Logs every iteration, saves now and then and when stopped."""
+    """Iterate to the last planned step: what was learned. Logs every iteration, saves now and then."""
     per_iteration, total = steps_per_iteration(experiment), planned_steps(experiment)
     all_per_iteration = len(seeds) * experiment.runs_per_seed * per_iteration
     step, last_save = learning.iteration * per_iteration, time.monotonic()
@@ -348,8 +348,8 @@ def _learn(
             rate = all_per_iteration / (time.monotonic() - begun)
             log.write(step, {**metrics, "time/steps_per_second": rate})
             progress.update(step, _headline(experiment, metrics))
-            if env.physics.snapshot_alters:
-                due = learning.iteration % max(1, SNAPSHOT_STEPS // all_per_iteration) == 0
+            if env.physics.restore_alters:
+                due = learning.iteration % max(1, SAVE_EVERY_STEPS // all_per_iteration) == 0
             else:
                 due = stop_asked() or time.monotonic() - last_save > checkpoint_seconds
             if due:
@@ -392,7 +392,10 @@ def _tree(env: Environment, learning: Learning) -> dict[str, Any]:
 
 
 def _save(run: RunDir, env: Environment, learning: Learning, step: int) -> None:
-    run.save_checkpoint(step, _tree(env, learning), {"iteration": learning.iteration})
+    tree = _tree(env, learning)
+    run.save_checkpoint(step, tree, {"iteration": learning.iteration})
+    if env.physics.restore_alters:
+        env.physics.restore(tree["engine"])
 
 
 def _resume(run: RunDir, env: Environment, fresh: Learning) -> Learning:

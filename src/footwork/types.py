@@ -53,7 +53,9 @@ class Physics(Protocol):
 
     traceable: bool  # may be called inside jit (MJX), or only from the host (C engines)
     resumable: bool  # snapshot() holds all there is: a run can go on bit for bit
-    snapshot_alters: bool  # the ants feel a snapshot(): runs that are to be equal take it at equal steps
+    restore_alters: (
+        bool  # the ants feel a restore(): a run that saved itself restores itself, to be as one that goes on
+    )
     control_dt: float  # seconds per control step
     num_envs: int
 
@@ -76,13 +78,12 @@ class Physics(Protocol):
         """Advance one control step; rows outside ``active`` are held and cost nothing."""
 
     def snapshot(self) -> dict[str, Any]:
-        """The engine's whole hidden state as named arrays (empty where all of it is in PhysicsState).
-
-        Going on from here is the same as going on from :meth:`restore`.
-        """
+        """The engine's whole hidden state as named arrays (empty where all of it is in PhysicsState)."""
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        """Continue, bit for bit, from what :meth:`snapshot` returned.
+        """Continue from what :meth:`snapshot` returned, bit for bit as every engine that is restored from it.
+
+        Where ``restore_alters`` is false, that is also how the one went on that it was taken from.
 
         Raises:
             ValueError: the engine is not ``resumable``; one line that says why.

@@ -33,6 +33,12 @@ ENGINES: dict[str, Engine] = {
 }
 
 
+def libraries_of(name: str) -> tuple[str, ...]:
+    """The distributions whose versions the numbers of a run on this engine depend on."""
+    extra = ENGINES[name].library.replace(".", "-")
+    return ("jax", "mujoco", *([extra] if extra else []))
+
+
 def check_engine(name: str) -> None:
     """Refuse an engine that does not exist.
 

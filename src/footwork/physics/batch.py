@@ -45,7 +45,7 @@ class BatchPhysics:
 
     traceable = False
     resumable = True
-    snapshot_alters = False
+    restore_alters = False
 
     def __init__(self, robot: Robot, arena: Arena, num_envs: int, num_threads: int = 0):
         if num_envs < 1:

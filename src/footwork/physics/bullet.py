@@ -30,6 +30,7 @@ from footwork.types import NUM_FEET, NUM_JOINTS, QPOS_SIZE, QVEL_SIZE, PhysicsSt
 SHIN_NAMES = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")  # links, in the legs' order
 MAX_WORLDS = 1000  # per process; PyBullet has room for 1024 clients
 WORLD_MEGABYTES = 30  # measured
+NOWHERE = (0.0, 0.0, 1000.0)  # m; touches nothing
 HUGE_PAGES = "glibc.malloc.hugetlb=1"  # for so many worlds: a tenth faster with 128 of them; elsewhere not heeded
 # pybullet_envs: scene_abstract.World, scene_stadium.StadiumScene, robot_bases.MJCFBasedRobot
 GRAVITY = 9.8  # m/s^2
@@ -37,10 +38,9 @@ SUBSTEPS, SOLVER_ITERATIONS, CONTACT_ERP = 4, 5, 0.9
 GROUND = {"lateralFriction": 0.8, "restitution": 0.5}  # times the ant's own friction of 1.5
 
 CANNOT_RESUME = (
-    "engine bullet-original tells of the ant what AntBulletEnv tells, which is not where it is, so a run on it cannot "
-    "go on bit for bit; train it anew under another --name"
+    "engine bullet-original reports the mean of the ant's parts as its position, and contacts a step late: no ant can "
+    "be put back from that, so a run on it cannot go on bit for bit; train it anew under another --name"
 )
-_SNAPSHOT = ("qpos", "qvel", "touching", "failed")  # of _Shared
 _NOT_ITS_OWN = ("name", "reset_height", "reset_ankle_deg", "reset_joint_noise", "fall_height")  # the task's, of a Robot
 
 
@@ -54,9 +54,9 @@ class BulletPhysics:
     a number that float32 cannot, or is given one, is reported in ``diverged`` and is not
     stepped until it is reset.
 
-    PyBullet keeps its solver's memory of contacts to itself. So a snapshot forgets it, too: it puts
-    every ant down anew, where it is and as fast as it is, and whoever goes on from the snapshot
-    later does what who took it does.
+    PyBullet keeps its solver's memory of contacts to itself. So ``restore`` forgets it: it puts every
+    ant down anew, where it was and as fast as it was. All that are restored from a snapshot go on
+    alike, the engine that it was taken from only if it is restored too.
 
     Args:
         robot: must be PyBullet's ant as far as physics goes: masses, torques, limits and friction
@@ -87,7 +87,8 @@ class BulletPhysics:
         _check_room(num_envs, num_workers)
         self.control_dt = robot.control_dt
         self.num_envs = num_envs
-        self.resumable = self.snapshot_alters = not original_env  # which reports what is not the state
+        self.resumable = not original_env
+        self.restore_alters = self.resumable
         self._reset_height = robot.reset_height
         with tempfile.TemporaryFile() as file:
             file.truncate(_Shared.size(num_envs))
@@ -133,25 +134,30 @@ class BulletPhysics:
         return self.read(simulation)
 
     def snapshot(self) -> dict[str, Any]:
-        """Where all ants are, in float64, contacts and failures; nothing with ``original_env``."""
+        """Where all ants are and how fast, in float64, contacts and failures; nothing with ``original_env``."""
         if not self.resumable:
             return {}
-        arrays = {name: getattr(self._shared, name).copy() for name in _SNAPSHOT}
-        self.restore(arrays)
-        return arrays
+        shared = self._shared
+        return {
+            "qpos": shared.qpos.copy(),
+            "qvel": shared.qvel.copy(),
+            "touching": shared.touching.copy(),
+            "failed": shared.failed.copy(),
+        }
 
     def restore(self, arrays: dict[str, Any]) -> None:
-        """Put all ants where they were; refused with ``original_env``.
+        """Put all ants where they were, with every contact forgotten; refused with ``original_env``.
 
         Raises:
             ValueError: :data:`CANNOT_RESUME`.
         """
         if not self.resumable:
             raise ValueError(CANNOT_RESUME)
-        for name in _SNAPSHOT:
-            getattr(self._shared, name)[:] = arrays[name]
-        self._command(b"i", np.flatnonzero(~self._shared.failed))
-        self._shared.touching[:] = arrays["touching"]  # for the ants it is the step before that counts
+        failed = np.asarray(arrays["failed"])
+        self._shared.qpos[:], self._shared.qvel[:] = arrays["qpos"], arrays["qvel"]
+        self._command(b"i", np.flatnonzero(~failed))
+        self._shared.failed[failed] = True  # they stay where they are until they are reset
+        self._shared.touching[:] = arrays["touching"]  # what the last step reported is still to be observed
 
     def close(self) -> None:
         """End the worker processes."""
@@ -374,6 +380,8 @@ class World:
         """Place the ant, with everything that went before forgotten."""
         w, x, y, z = qpos[3:7]
         self._call("restoreState", stateId=self._start)
+        self._call("resetBasePositionAndOrientation", self._ant, NOWHERE, (0.0, 0.0, 0.0, 1.0))
+        self._call("performCollisionDetection")  # or contacts at where it was would be remembered
         self._call("resetBasePositionAndOrientation", self._ant, qpos[:3], (x, y, z, w))
         self._call("resetBaseVelocity", self._ant, qvel[:3], _turn(self._matrix((x, y, z, w)), qvel[3:6]))
         for joint, angle, speed in zip(self._joints, qpos[7:], qvel[6:], strict=True):

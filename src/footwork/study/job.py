@@ -1,8 +1,8 @@
 """One run of a study, whole: train a row with one seed, then measure it. ``python -m footwork.study.job '{...}'``.
 
 A process of its own, that whoever starts it pins to a core. It may be killed at any moment and
-started again; what is done is not done twice. It ends itself, saved, when its
-standard input closes: that is, when the process that started it is gone.
+started again; what is done is not done twice. It ends itself, saved as far as its engine
+allows, when its standard input closes: that is, when the process that started it is gone.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from footwork.study.training_curves import read_curve
 from footwork.train import Experiment, Interrupted, TrainingDiverged, policy_meta
 
 WAIT_FOR_LOCK = 120.0  # s; a run whose last process was killed may still be saving
-STOPPED = 130  # exit status of a run that was asked to stop, and saved itself
+STOPPED = 130  # exit status of a run that was asked to stop; it goes on later
 
 
 def find_run(study: Study, row: str, seed: int) -> RunDir | None:
@@ -124,7 +124,7 @@ def _failed(error: Exception) -> int:
 
 
 def _end_with_parent() -> None:
-    """Ask this process to save and stop when nobody holds the other end of its standard input."""
+    """Ask this process to stop in good order when nobody holds the other end of its standard input."""
     while os.read(0, 4096):
         pass
     os.kill(os.getpid(), signal.SIGTERM)

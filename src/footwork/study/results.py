@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from footwork.physics import libraries_of
 from footwork.record import RunDir, RunError, config_from_json
 from footwork.statistics import Effect, Floats, contrast, generator_for
 from footwork.study.experiments import EXPERIMENTS, MAIN, is_row
@@ -222,7 +223,8 @@ def strays(study: Study) -> list[str]:
 def _mixed_versions(row: str, samples: tuple[Sample, ...]) -> list[str]:
     """Runs of one row that other code or libraries made count all the same; it is said."""
     problems = []
-    for library in ("footwork", "source", "jax", "mujoco"):
+    engines = {sample.experiment.engine for sample in samples}
+    for library in ("footwork", "source", *dict.fromkeys(name for engine in engines for name in libraries_of(engine))):
         found = sorted({str(sample.run.versions().get(library, "unknown")) for sample in samples})
         if len(found) > 1:
             problems.append(f"runs of {row} were made with different versions of {library}: {', '.join(found)}")

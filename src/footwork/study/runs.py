@@ -24,7 +24,7 @@ import jax
 
 from footwork import checkpoint
 from footwork.checkpoint import CheckpointError
-from footwork.physics import require_engine
+from footwork.physics import libraries_of, require_engine
 from footwork.record import RunDir, RunError, config_from_json, config_to_json, versions
 from footwork.study.experiments import find_row, is_row, with_robot
 from footwork.train import Experiment, Trained, planned_steps, policy_meta, train
@@ -81,7 +81,8 @@ def train_row(
     The directory is ``runs`` / row / ``name``, or the one of :func:`path_of_new_run`.
 
     With ``resume``, goes on from the newest checkpoint, or returns a finished run as it
-    is; a larger ``total_steps`` than it was finished with is trained on to.
+    is; a larger ``total_steps`` than it was finished with is trained on to (on PyBullet from
+    the newest checkpoint too, which may lie before its end).
 
     Raises:
         ValueError: bad seeds, the run was begun with another config, or its engine cannot resume (bullet-original).
@@ -94,7 +95,7 @@ def train_row(
     path = path_of_new_run(runs, experiment, seeds) if name is None else runs / experiment.name / name
     config = {"experiment": config_to_json(experiment), "seeds": list(seeds)}
     if resume and (path / "config.json").is_file():
-        run = _reopen(path, config)
+        run = _reopen(path, config, experiment.engine)
     else:
         _find_or_train_needed(experiment, runs, num_threads)  # a refusal leaves no directory behind
         run = RunDir.create(path, config)
@@ -113,18 +114,17 @@ def _check_seeds(seeds: tuple[int, ...]) -> None:
             raise ValueError(f"a seed must be in 0..{MAX_SEED}, got {seed}")
 
 
-def _reopen(path: Path, config: dict[str, Any]) -> RunDir:
+def _reopen(path: Path, config: dict[str, Any], engine: str) -> RunDir:
     """The run there, if it is the same but for its length."""
     run = RunDir.open_existing(path)
     old = run.config()
     if _without_steps(old) != _without_steps(config):
         raise ValueError(f"{path} was begun with another config: resume with that one, or choose another --name")
     then, now = run.versions(), versions()
-    for name in ("jax", "mujoco"):  # with another, the numbers would not be those of an uninterrupted run
-        if then.get(name) != now[name]:
-            raise ValueError(
-                f"{path} was begun with {name} {then.get(name)}, this is {now[name]}: use that, or begin anew"
-            )
+    for name in libraries_of(engine):  # with another, the numbers would not be those of an uninterrupted run
+        if then.get(name) != now.get(name):
+            begun = then.get(name, "of a version that was not recorded")
+            raise ValueError(f"{path} was begun with {name} {begun}, this is {now.get(name)}: use that, or begin anew")
     return run
 
 

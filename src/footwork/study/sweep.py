@@ -31,7 +31,7 @@ from footwork.train import planned_steps
 
 POLL = 0.25  # s between two looks at the processes
 PLAIN_EVERY = 60.0  # s between two lines of progress where there is no terminal
-STOP_WITHIN = 60.0  # s that processes get to save themselves
+STOP_WITHIN = 60.0  # s that processes get to end in good order
 LAUNCHERS = ("local", "ray")
 RETRIES = 3  # of a run whose process, or whose node in a cluster, was lost
 _MEASURING = 0.15  # of a run's time, that comes after its last control step
@@ -124,7 +124,7 @@ Display = Callable[[Board], None]
 
 
 class SweepStopped(RuntimeError):
-    """The sweep was asked to stop; every run has saved itself."""
+    """The sweep was asked to stop; every run has stopped, and goes on where it was saved."""
 
 
 def run_study(
@@ -336,7 +336,7 @@ def _settle(board: Board, job: Job, status: int, seconds: float, log: Callable[[
 
 
 def _stop_all(processes: Sequence[subprocess.Popen[bytes]]) -> None:
-    """Ask for an end, wait until everything is saved, and only then insist."""
+    """Ask for an end, wait until everything that can be is saved, and only then insist."""
     for process in processes:
         with contextlib.suppress(OSError):
             process.terminate()

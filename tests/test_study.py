@@ -43,6 +43,7 @@ from footwork.study.experiments import (
     INTERLEAVED_WITHOUT,
     LIGHT_WITH_BONUS,
     MAIN,
+    SCHEDULES,
     find_row,
     is_row,
     match_rows,
@@ -668,6 +669,16 @@ def test_every_comparison_has_its_rows_in_some_setting():
         settings = claims.settings_of(claim, ("", "light/", "bullet/"))
         for c in claim.contrasts:
             assert any(all(is_row(setting.fill(row)) for row in c.rows) for setting in settings), c.words
+
+
+def test_on_another_engine_the_papers_setting_is_judged_once_it_has_masters(study):
+    ours, papers = (f"bullet, heavy ant, {schedule}" for schedule in (SCHEDULES["hrl"], SCHEDULES["paper"]))
+    fill(study, ("bullet/walker/plain",), 1)
+    assert set(verdicts(study, 12)) == {"mujoco, heavy ant", "bullet, heavy ant"}
+    assert {ours, papers} & set(verdicts(study, 7)) == {ours}
+    fill(study, ("bullet/bandit/paper/plain",), 1)
+    assert {ours, papers} <= set(verdicts(study, 7))
+    assert {ours, papers} & set(verdicts(study, 8)) == {ours}
 
 
 def test_flat_policies_made_otherwise_are_shown_in_the_papers_setting_only(study):

@@ -17,7 +17,7 @@ from footwork.checkpoint import write_atomically
 from footwork.evaluate import HANDOVER_AFTER, HANDOVER_SPEED, HANDOVER_STEPS, IDLE_SPEED, SWITCHING_STEPS
 from footwork.record import source_digest
 from footwork.study.answers import ANSWERS, choices, said
-from footwork.study.claims import CLAIMS, Claim, rows_read
+from footwork.study.claims import CLAIMS, Claim
 from footwork.study.experiments import SCHEDULES, find_row, in_braces
 from footwork.study.figures import FIGURES, Drawn, count_in_words, draw_figures
 from footwork.study.judging import Finding, Judgement, judge_all, no_room, show_bound, show_chance, show_effect
@@ -93,7 +93,7 @@ def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> lis
     blocks += [Heading("Each claim in each setting"), _claims_table(judgements)]
     blocks += [Heading("Every comparison"), _comparisons_table(judgements)]
     made = _made(results, rows, command)  # reads files, and so may find problems with them
-    blocks += [Heading("Left out, and why"), *_left_out(results, drawn)]
+    blocks += [Heading("Left out, and why"), *_left_out(results, judgements, drawn)]
     blocks += [Heading("How this was made"), *made]
     return blocks
 
@@ -290,10 +290,10 @@ def _choices_table(results: Results) -> TableBlock:
     return TableBlock(("what", "here"), tuple((choice.what, choice.here) for choice in choices(results.study)))
 
 
-def _left_out(results: Results, drawn: Sequence[Drawn]) -> list[Block]:
+def _left_out(results: Results, judgements: Sequence[Judgement], drawn: Sequence[Drawn]) -> list[Block]:
     missing = list(dict.fromkeys(row for d in drawn for row in d.without))
     planned: dict[str, int] = {}
-    read = rows_read(prefixes_at_hand(results))
+    read = [row for j in judgements for f in j.findings if f.contrast.decides for row in f.rows]
     for job in plan(results.study):
         planned[job.row] = planned.get(job.row, 0) + 1
     missing += [row for row in (*planned, *read) if row not in missing and not results.samples(row)]

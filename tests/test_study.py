@@ -977,6 +977,15 @@ def test_figures_of_which_there_is_one_are_not_drawn_under_another_ant(study, tm
     assert [one.figure.name for one in drawn] == ["12-switching"]
 
 
+def test_masters_beside_their_sub_policies_are_not_drawn_where_there_are_no_masters(study, tmp_path):
+    fill(study, ("bullet/walker/plain",), 1)
+    both = find_figures(["11", "21"])
+    drawn = draw_figures(results.Results(study), both, tmp_path, "bullet/")
+    assert [one.figure.name for one in drawn] == ["11-handovers"]
+    fill(study, ("bullet/maze/hrl/plain",), 1)
+    assert len(draw_figures(results.Results(study), both, tmp_path, "bullet/")) == 2
+
+
 def test_a_way_that_was_lost_lies_within_its_panel(study):
     fill(study, ("bandit/hrl/interleaved",), 2)
     for k, seed in itertools.product((10, 400), (0, 1)):

@@ -32,7 +32,12 @@ class Association:
     @property
     def rows(self) -> tuple[str, ...]:
         """Rows of sub-policies, and of the masters on them."""
-        return (*(f"walker/{kind}" for kind in KINDS), *(f"{self.place}/{kind}" for kind in KINDS))
+        return (*(f"walker/{kind}" for kind in KINDS), *self.masters)
+
+    @property
+    def masters(self) -> tuple[str, ...]:
+        """Rows of the masters."""
+        return tuple(f"{self.place}/{kind}" for kind in KINDS)
 
 
 # On AntMaze with the paper's reward no master arrives: nothing to set beside anything.

@@ -48,7 +48,7 @@ def handover_maps(results: Results, rows: tuple[str, ...]) -> Any:
     lowest = min(np.floor(10 * least) / 10, 0.9)
     for ax, (row, entries) in zip(axes.flat, measured.items(), strict=False):
         ax.grid(False)
-        ax.set_title(f"{row.removeprefix('walker/')}\n{seeds_in_words(len(entries))}", fontsize=8)
+        ax.set_title(f"{row.partition('walker/')[2]}\n{seeds_in_words(len(entries))}", fontsize=8)
         if not entries:
             ax.axis("off")
             empty(ax, "no finished runs yet")

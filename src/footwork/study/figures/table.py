@@ -28,6 +28,7 @@ class Figure:
         rows: that it reads.
         paper: the figure of the paper that it answers, if any.
         once: there is one of it, and not one per engine and ant: it sets them side by side, or is about the default.
+        about: those of its rows of which it shows nothing without one; none: any of them is enough.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Figure:
     rows: tuple[str, ...] = ()
     paper: str = ""
     once: bool = False
+    about: tuple[str, ...] = ()
 
 
 class Drawn(NamedTuple):
@@ -267,6 +269,7 @@ FIGURES: tuple[Figure, ...] = (
         "Looked at after the runs, not one of the claims.",
         measures.masters_by_handovers,
         tuple(dict.fromkeys(row for association in ASSOCIATIONS for row in association.rows)),
+        about=tuple(row for association in ASSOCIATIONS for row in association.masters),
     ),
 )
 
@@ -292,7 +295,7 @@ def draw_figures(results: Results, figures: Iterable[Figure], to: Path, prefix: 
     """Draw figures into a folder, each as PNG and as SVG.
 
     With a prefix such as ``light/``, the same of the rows under it, into a folder of that name: results of
-    different engines and ants stay apart. Figures of which there is nothing under it are left out, and
+    different engines and ants stay apart. Figures that would show nothing under it are left out, and
     those of which there is one only.
     """
     note = "" if results.study.size.name == "full" else f"{results.study.size.name} study: short runs, few seeds"
@@ -302,7 +305,8 @@ def draw_figures(results: Results, figures: Iterable[Figure], to: Path, prefix: 
     for figure in figures:
         rows = tuple(prefix + row for row in figure.rows if is_row(prefix + row))
         without = tuple(row for row in rows if not results.samples(row))
-        if prefix and (figure.once or len(without) == len(rows)):
+        shows = {prefix + row for row in figure.about or figure.rows} & (set(rows) - set(without))
+        if prefix and (figure.once or not shows):
             continue
         with styled():
             files = save(figure.draw(results, rows), to / prefix / figure.name, note)

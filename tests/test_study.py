@@ -1070,6 +1070,13 @@ def test_one_seed_has_no_interval(study):
     assert judging.show_effect(variance.findings[0]) == "-"
 
 
+def test_a_study_on_an_engine_that_is_missing_is_refused_before_anything_is_begun(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("footwork.physics.find_spec", lambda name: None)
+    assert run(["reproduce", "--rows", "bullet/walker/symmetric", "--runs", str(tmp_path / "runs")]) == 1
+    assert "engine bullet needs an extra" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -148,7 +148,9 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(tmp_path, monkeypatch)
         return real(*arguments)
 
     monkeypatch.setattr(training, "iterate", interrupted)
-    with pytest.raises(Interrupted, match=r"stopped at step 48 of 96; saved at step 48 in .*, go on with --resume"):
+    with pytest.raises(
+        Interrupted, match=r"stopped at step 48 of 96; saved at step 48 in .*, the same command with --resume goes on"
+    ):
         train_row(tiny(row, 4), (0,), tmp_path / "parts", num_threads=1)
     monkeypatch.setattr(training, "iterate", real)
     with pytest.raises(RunError, match="holds an unfinished run: use --resume"):

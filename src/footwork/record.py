@@ -38,6 +38,7 @@ import sys
 import time
 import types
 import typing
+import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -244,8 +245,10 @@ class RunDir:
         Raises:
             RunError: the metrics cannot be read or cut.
         """
-        if self.finished and int(self.summary().get("steps", step)) > step:
-            (self.path / "DONE").unlink()  # it ended later than it goes on from: it is not finished any more
+        if self.finished and (end := int(self.summary().get("steps", step))) > step:
+            (self.path / "DONE").unlink()
+            said = f"it ended at step {end}, and goes on from step {max(step, 0)}"
+            warnings.warn(f"{self.path} is not finished any more: {said}", stacklevel=2)
         truncate_metrics(self.metrics_path, step)
         late = [path for at, path in self.checkpoints() if at > step]
         torn = [path for place in (self.path, self.path / "checkpoints") for path in place.glob(".*.tmp")]

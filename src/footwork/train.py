@@ -365,7 +365,9 @@ def _way_on(experiment: Experiment, env: Environment, run: RunDir) -> str:
     saved = [step for step, _ in run.checkpoints()]
     where = f"saved at step {saved[-1]} in {run.path}" if saved else f"nothing is saved in {run.path} yet"
     return f"{where}, " + (
-        "go on with --resume" if env.physics.resumable else f"but engine {experiment.engine} cannot resume"
+        "the same command with --resume goes on"
+        if env.physics.resumable
+        else f"but engine {experiment.engine} cannot resume"
     )
 
 
@@ -393,9 +395,14 @@ def _tree(env: Environment, learning: Learning) -> dict[str, Any]:
 
 def _save(run: RunDir, env: Environment, learning: Learning, step: int) -> None:
     tree = _tree(env, learning)
-    run.save_checkpoint(step, tree, {"iteration": learning.iteration})
+    run.save_checkpoint(step, tree, {"iteration": learning.iteration, **_pace(env)})
     if env.physics.restore_alters:
         env.physics.restore(tree["engine"])
+
+
+def _pace(env: Environment) -> dict[str, int]:
+    """What a checkpoint says of when the others come, where that is part of what makes the numbers."""
+    return {"save_every_steps": SAVE_EVERY_STEPS} if env.physics.restore_alters else {}
 
 
 def _resume(run: RunDir, env: Environment, fresh: Learning) -> Learning:
@@ -407,6 +414,8 @@ def _resume(run: RunDir, env: Environment, fresh: Learning) -> Learning:
         run.rewind(latest.step)
         return fresh
     tree, meta = checkpoint.load(latest.path, _tree(env, fresh))
+    if meta.get("save_every_steps") != _pace(env).get("save_every_steps"):
+        raise ValueError(f"{run.path} has its checkpoints at other steps than this version: choose another --name")
     for damage in latest.skipped:
         warnings.warn(f"going on from step {latest.step}: {damage}", stacklevel=2)
     env.physics.restore(tree["engine"])

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from footwork.doors import tables
+from footwork.physics import require_engine
 from footwork.record import RunError
 from footwork.study.experiments import is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
@@ -29,6 +30,8 @@ def reproduce(command: Reproduce) -> int:
     if command.plan:
         tables.show(tables.plan_table(jobs, size.name))
         return 0
+    for row in {study.row(job.row) for job in jobs}:
+        require_engine(row.engine, row.task.robot)
     to = command.to or Path(f"report{ending}")
     check_place(study, to)
     mark(study)

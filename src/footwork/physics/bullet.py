@@ -29,7 +29,7 @@ from footwork.types import NUM_FEET, NUM_JOINTS, QPOS_SIZE, QVEL_SIZE, PhysicsSt
 
 SHIN_NAMES = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")  # links, in the legs' order
 MAX_WORLDS = 1000  # per process; PyBullet has room for 1024 clients
-WORLD_MEGABYTES = 30  # measured
+WORLD_MEGABYTES = 33  # measured, in huge pages
 NOWHERE = (0.0, 0.0, 1000.0)  # m; touches nothing
 HUGE_PAGES = "glibc.malloc.hugetlb=1"  # for so many worlds: a tenth faster with 128 of them; elsewhere not heeded
 # pybullet_envs: scene_abstract.World, scene_stadium.StadiumScene, robot_bases.MJCFBasedRobot
@@ -62,7 +62,7 @@ class BulletPhysics:
         robot: must be PyBullet's ant as far as physics goes: masses, torques, limits and friction
             are those of ``heavy``; fields that only MuJoCo reads are ignored but must be ``heavy``'s too.
         arena: whose walls stand in every world.
-        num_envs: N. Each takes 30 MB, most of them PyBullet's buffers.
+        num_envs: N. Each takes 33 MB, most of them PyBullet's buffers.
         num_workers: processes; 0 means all cores.
         original_env: report what AntBulletEnv-v0 reports, with its peculiarities, for comparisons with it: x and y
             are the mean over the ant's 21 parts and the floor (which lies at 0 and joins the

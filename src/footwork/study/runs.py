@@ -95,12 +95,12 @@ def train_row(
     path = path_of_new_run(runs, experiment, seeds) if name is None else runs / experiment.name / name
     config = {"experiment": config_to_json(experiment), "seeds": list(seeds)}
     if resume and (path / "config.json").is_file():
-        run = _reopen(path, config, experiment.engine)
+        run = _reopen(path, config, experiment)
     else:
         _find_or_train_needed(experiment, runs, num_threads)  # a refusal leaves no directory behind
         run = RunDir.create(path, config)
     with run.lock():
-        if run.finished and run.summary()["steps"] >= planned_steps(experiment):
+        if _has_ended(run, experiment):
             return load_run(run)
         needed = _keep_needed(experiment, run, runs, num_threads)
         return train(experiment, seeds, run, needed, num_threads, tensorboard=tensorboard)
@@ -114,17 +114,27 @@ def _check_seeds(seeds: tuple[int, ...]) -> None:
             raise ValueError(f"a seed must be in 0..{MAX_SEED}, got {seed}")
 
 
-def _reopen(path: Path, config: dict[str, Any], engine: str) -> RunDir:
+def _has_ended(run: RunDir, experiment: Experiment) -> bool:
+    """Whether it is finished, and long enough."""
+    return run.finished and run.summary()["steps"] >= planned_steps(experiment)
+
+
+def _reopen(path: Path, config: dict[str, Any], experiment: Experiment) -> RunDir:
     """The run there, if it is the same but for its length."""
     run = RunDir.open_existing(path)
     old = run.config()
     if _without_steps(old) != _without_steps(config):
         raise ValueError(f"{path} was begun with another config: resume with that one, or choose another --name")
+    if _has_ended(run, experiment):
+        return run
     then, now = run.versions(), versions()
-    for name in libraries_of(engine):  # with another, the numbers would not be those of an uninterrupted run
-        if then.get(name) != now.get(name):
-            begun = then.get(name, "of a version that was not recorded")
-            raise ValueError(f"{path} was begun with {name} {begun}, this is {now.get(name)}: use that, or begin anew")
+    for name in libraries_of(experiment.engine):  # with another, the numbers would not be those of an uninterrupted run
+        if name not in then:
+            raise ValueError(f"{path} did not record its {name}, so it cannot go on bit for bit: choose another --name")
+        if then[name] != now.get(name):
+            raise ValueError(
+                f"{path} was begun with {name} {then[name]}, this is {now.get(name)}: use that, or begin anew"
+            )
     return run
 
 

@@ -360,7 +360,7 @@ def test_what_is_out_of_range_is_refused():
         ((0, 1), "num_envs must be >= 1, got 0"),
         ((1, -1), "num_workers must be >= 0"),
         ((1001, 1), "PyBullet holds 1000 ants per process"),
-        ((10**7, 10**5), "ants on engine bullet take 300000 GB"),
+        ((10**7, 10**5), "ants on engine bullet take 330000 GB"),
     ):
         with pytest.raises(ValueError, match=message):
             BulletPhysics(HEAVY, open_field(), *arguments)

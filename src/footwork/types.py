@@ -53,9 +53,7 @@ class Physics(Protocol):
 
     traceable: bool  # may be called inside jit (MJX), or only from the host (C engines)
     resumable: bool  # snapshot() holds all there is: a run can go on bit for bit
-    restore_alters: (
-        bool  # the ants feel a restore(): a run that saved itself restores itself, to be as one that goes on
-    )
+    restore_alters: bool  # the ants feel a restore(): whoever saves restores too, and goes on as one who resumes
     control_dt: float  # seconds per control step
     num_envs: int
 

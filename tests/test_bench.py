@@ -282,3 +282,18 @@ def test_compiled_programs_are_kept_where_the_user_wants_them(monkeypatch, tmp_p
     assert place(FOOTWORK_CACHE=tmp_path / "x").startswith(str(tmp_path / "x" / "jax-"))
     assert place(FOOTWORK_CACHE="") is None
     assert place(FOOTWORK_CACHE=tmp_path, JAX_COMPILATION_CACHE_DIR="theirs") == "theirs"
+
+
+def test_an_accelerator_is_left_alone_but_by_the_engine_that_computes_on_it(monkeypatch):
+    def platforms(*arguments, theirs=None):
+        monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+        if theirs:
+            monkeypatch.setenv("JAX_PLATFORMS", theirs)
+        cli.leave_accelerators(list(arguments))
+        return os.environ.get("JAX_PLATFORMS")
+
+    monkeypatch.setenv("JAX_PLATFORMS", "")  # so that it is put back afterwards
+    assert platforms("train", "walker/plain") == "cpu"
+    assert platforms("train", "walker/plain", theirs="cuda") == "cuda"
+    for named in (("walker/plain", "--engine", "mjx"), ("walker/plain", "--engine=mjx"), ("mjx/walker/plain",)):
+        assert platforms("train", *named) is None

@@ -46,6 +46,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TextIO, TypeVar, Union
 
+import jax
 import numpy as np
 
 import footwork
@@ -402,7 +403,8 @@ def config_from_json(cls: type[_Config], data: Any) -> _Config:
 def versions() -> dict[str, str]:
     """Of what a run's numbers depend on: the package, its source, Python, the libraries and the platform.
 
-    The source's commit is among them where it is known (:func:`source_commit`).
+    The source's commit is among them where it is known (:func:`source_commit`), and what JAX computes on where that is
+    not the CPU.
     """
     found = {
         "footwork": str(getattr(footwork, "__version__", "unknown")),
@@ -418,6 +420,8 @@ def versions() -> dict[str, str]:
     for name in ("pybullet", "mujoco-mjx"):  # extras: engines
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
+    if (device := jax.devices()[0]).platform != "cpu":
+        found["device"] = device.device_kind
     system = "-".join((platform.system(), platform.machine(), *filter(None, platform.libc_ver())))
     return {**found, "platform": system}
 

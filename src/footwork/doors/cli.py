@@ -42,6 +42,7 @@ Command = (
 def main() -> None:
     """The entry point."""
     keep_compiled()
+    leave_accelerators(sys.argv[1:])
     sys.exit(run(sys.argv[1:]))
 
 
@@ -57,6 +58,16 @@ def keep_compiled() -> None:
     if place:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(place, f"jax-{_processor()}")))
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+def leave_accelerators(arguments: list[str]) -> None:
+    """Have JAX compute on the CPU, on a machine with a GPU too, unless the command names the engine that runs there.
+
+    The other engines step ants from the host, many small calls a step: a GPU between them would slow all of it, and be
+    taken from others. ``JAX_PLATFORMS``, JAX's own variable, goes before.
+    """
+    if not any("mjx" in argument for argument in arguments):  # --engine mjx, mjx/walker/plain, runs/mjx/...
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 
 def _processor() -> str:

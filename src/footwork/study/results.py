@@ -228,6 +228,9 @@ def _mixed_versions(row: str, samples: tuple[Sample, ...]) -> list[str]:
         found = sorted({str(sample.run.versions().get(library, "unknown")) for sample in samples})
         if len(found) > 1:
             problems.append(f"runs of {row} were made with different versions of {library}: {', '.join(found)}")
+    devices = sorted({str(sample.run.versions().get("device", "the CPU")) for sample in samples})
+    if len(devices) > 1:
+        problems.append(f"runs of {row} were made on different devices: {', '.join(devices)}")
     return problems
 
 

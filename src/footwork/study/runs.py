@@ -135,6 +135,9 @@ def _reopen(path: Path, config: dict[str, Any], experiment: Experiment) -> RunDi
             raise ValueError(
                 f"{path} was begun with {name} {then[name]}, this is {now.get(name)}: use that, or begin anew"
             )
+    before, here = (found.get("device", "the CPU") for found in (then, now))
+    if before != here:
+        raise ValueError(f"{path} was begun on {before}, JAX computes on {here} now: use that, or begin anew")
     return run
 
 

@@ -108,6 +108,17 @@ def test_a_finished_run_is_kept_and_another_config_refused(tmp_path):
         train_row(tiny("walker/symmetric", 1, fall_rule="flip"), (0,), tmp_path, resume=True)
 
 
+def test_a_run_of_another_device_is_not_gone_on_with(tmp_path):
+    train_row(tiny("walker/symmetric", 1), (0,), tmp_path, num_threads=1)
+    path = run_path(tmp_path, "walker/symmetric", (0,)) / "config.json"
+    content = json.loads(path.read_text())
+    content["versions"]["device"] = "NVIDIA H200"
+    path.write_text(json.dumps(content))
+    assert train_row(tiny("walker/symmetric", 1), (0,), tmp_path, resume=True)  # it is finished
+    with pytest.raises(ValueError, match="was begun on NVIDIA H200, JAX computes on the CPU now"):
+        train_row(tiny("walker/symmetric", 2), (0,), tmp_path, resume=True)
+
+
 def test_a_diverged_learner_names_step_metric_and_last_checkpoint(tmp_path):
     experiment = tiny("walker/symmetric", 8)
     broken = replace(experiment, ppo=replace(experiment.ppo, learning_rate=1e38))

@@ -257,6 +257,50 @@ def test_curves_are_the_runs_metrics_in_bins(study):
         training_curves.read_curve(run, experiment)
 
 
+def side_by_side(paths):
+    """One run of the seeds of several, in place of those: twice as fast a run as each, in the control steps of all."""
+    together = paths[0].with_name("seeds-" + "-".join(path.name.rpartition("-")[2] for path in paths))
+    shutil.copytree(paths[0], together)
+    files = [{name: json.loads((path / name).read_text()) for name in ("DONE", "evaluation.json")} for path in paths]
+    done, evaluation = files[0]["DONE"], files[0]["evaluation.json"]
+    config = json.loads((together / "config.json").read_text())
+    done["seeds"] = config["config"]["seeds"] = [seed for file in files for seed in file["DONE"]["seeds"]]
+    evaluation["by_seed"] = [entry for file in files for entry in file["evaluation.json"]["by_seed"]]
+    for name, content in (("DONE", done), ("evaluation.json", evaluation), ("config.json", config)):
+        write(together / name, content)
+    with (together / "metrics.jsonl").open("w") as file:
+        for lines in zip(*(read_metrics(path / "metrics.jsonl") for path in paths), strict=True):
+            line = {name: lines[0][name] for name in ("step", "time/steps_per_second")}
+            line["time/steps_per_second"] *= 2
+            for name in lines[0].keys() - line.keys():
+                line[name] = [*itertools.chain(*(other[name] for other in lines))]
+            file.write(json.dumps(line).replace("NaN", '"nan"') + "\n")
+    for path in paths:
+        shutil.rmtree(path)
+    return together
+
+
+def test_seeds_that_trained_side_by_side_count_as_they_would_alone(study):
+    row = "maze/flat/free"
+    paths = [fake_run(study, row, seed) for seed in (3, 4, 5)]
+    fake_run(study, row, 0)
+    alone = results.Results(study)
+    ways, curves = alone.scores_by_seed(row, "way"), alone.curves(row)
+    seconds = alone.training_seconds(row)
+    side_by_side(paths)
+    together = results.Results(study)
+    assert together.scores_by_seed(row, "way") == ways
+    for (_, one), (sample, other) in zip(curves, together.curves(row), strict=True):
+        np.testing.assert_array_equal(one.values["progress"], other.values["progress"])
+        if sample.seed:  # three seeds in the time of a half as many: half the time each
+            np.testing.assert_allclose(other.seconds[-1], curves[1][1].seconds[-1] / 2, rtol=1e-2)
+    assert together.training_seconds(row)[0] == seconds[0]
+    assert not together.problems
+    made = "\n".join(str(block) for block in report._made(together, [row], "footwork report"))
+    assert "footwork reproduce --rows maze/flat/free --seeds 4" in made
+    assert "footwork train maze/flat/free --seeds 3 4 5  #" in made
+
+
 def test_what_does_not_count_is_left_out_by_name(study):
     row = "maze/flat/free"
     paths = [fake_run(study, row, seed) for seed in range(6)]
@@ -517,12 +561,13 @@ def test_a_report_of_nothing_is_refused_with_the_reasons(study, tmp_path, capsys
 def test_mixed_runs_are_named(study):
     paths = [fake_run(study, "maze/flat/free", seed) for seed in range(2)]
     config = json.loads((paths[0] / "config.json").read_text())
-    config["versions"]["mujoco"] = "3.3.0"
+    config["versions"] |= {"mujoco": "3.3.0", "device": "NVIDIA H200"}
     write(paths[0] / "config.json", config)
     shutil.copy(paths[0] / "evaluation.json", paths[1])
     found = results.Results(study)
     assert len(found.scores("maze/flat/free", "way")) == 1
     assert any("different versions of mujoco: 3.3.0, " in problem for problem in found.problems)
+    assert any("on different devices: NVIDIA H200, the CPU" in problem for problem in found.problems)
     assert any("says nothing of seed 1" in problem for problem in found.problems)
 
 

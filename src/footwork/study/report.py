@@ -335,6 +335,11 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     here = f"footwork {footwork.__version__}, Python {platform.python_version()}"
     quick = "" if results.study.size.short is None else " --quick"
     made = [f"footwork reproduce{quick} --rows {in_braces(group)} --seeds {n}" for n, group in sorted(by_count.items())]
+    made += [
+        f"footwork train {row} --seeds {' '.join(map(str, seeds))}  # side by side, before the others"
+        for row in rows
+        for seeds in _side_by_side(results, row)
+    ]
     again = "footwork report --runs results --to .  # in this folder: the same report from the files beside it"
     return [
         Text("The runs that are in it (seeds 0, 1, ... of each row):"),
@@ -347,6 +352,14 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
         ),
         TableBlock(("version of", "is", "runs"), versions),
     ]
+
+
+def _side_by_side(results: Results, row: str) -> list[list[int]]:
+    """The seeds of a row that one run trained together, run by run."""
+    together: dict[Path, list[int]] = {}
+    for sample in results.samples(row):
+        together.setdefault(sample.run.path, []).append(sample.seed)
+    return [seeds for seeds in together.values() if len(seeds) > 1]
 
 
 __all__ = ["report_blocks", "write_report"]

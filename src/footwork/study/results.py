@@ -98,9 +98,8 @@ class Results:
         return None if whole is None else of_seed(whole, sample.experiment, sample.index)
 
     def training_seconds(self, row: str) -> list[float]:
-        """How long each run of a row trained; several seeds may have been trained in one."""
-        one_per_run = {sample.run.path: sample for sample in self.samples(row)}.values()
-        return [float(curve.seconds[-1]) for sample in one_per_run if (curve := self.curve(sample)) is not None]
+        """How long each seed of a row trained; of seeds that trained side by side, an equal share of their time."""
+        return [float(curve.seconds[-1]) for _, curve in self.curves(row)]
 
     def measurements(self, row: str, name: str) -> list[dict[str, Any]]:
         """The entries of a file of measurements, one per seed that has them."""

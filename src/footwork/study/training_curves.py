@@ -153,11 +153,12 @@ def _curve_from_json(content: dict[str, Any], learners: int) -> Curve:
 
 
 def of_seed(curve: Curve, experiment: Experiment, index: int) -> Curve:
-    """The learners of a run's seed, by its index."""
+    """The learners of a run's seed, by its index, and an equal share of the time that all its seeds took."""
     each = experiment.runs_per_seed
     mine = slice(index * each, (index + 1) * each)
     values = {name: value[:, mine] for name, value in curve.values.items()}
-    return curve._replace(episodes=curve.episodes[:, mine], values=values)
+    share = each / curve.episodes.shape[1]
+    return Curve(curve.step, curve.seconds * share, curve.episodes[:, mine], values)
 
 
 def mean_between(curve: Curve, name: str, begin: float, end: float) -> Floats:

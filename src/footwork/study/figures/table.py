@@ -189,7 +189,8 @@ FIGURES: tuple[Figure, ...] = (
         "15-success",
         "Success in training, against steps and against wall time",
         "Share of the episodes that end in the goal, over the last twentieth of the training each time; sub-policies' "
-        f"own training ({{own_steps}} control steps) not counted. {_BANDS}",
+        "own training ({own_steps} control steps) not counted. Seeds that trained side by side have an equal share of "
+        f"their time each. {_BANDS}",
         curves.success_curves,
         (
             *_on_kinds("bandit", schedules=("hrl",)),

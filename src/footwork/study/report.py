@@ -132,7 +132,8 @@ def _reading() -> tuple[str, ...]:
 def _rows_read(results: Results) -> str:
     return (
         "Interquartile means over seeds with 95 % intervals. Control steps: of one run, all its directions counted. "
-        "Minutes: of training, mean over runs, one core each, without the measuring that follows "
+        "Minutes: of training, mean over seeds, one core each (seeds that trained side by side have an equal share of "
+        "their time), without the measuring that follows "
         f"({results.study.size.episodes} episodes, drawn from the policy and not its mean, or the hand-over matrix and "
         "random switching). Hand-overs: orthogonal ones that succeed; m/s after: along the new direction, after "
         "failed ones too. Idle, upside down: options that gain less than "

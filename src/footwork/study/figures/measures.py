@@ -19,6 +19,7 @@ from footwork.study.experiments import (
     INTERLEAVED_WITHOUT,
     INTERLEAVED_WITHOUT_MASTERS,
     LIGHT_WITH_BONUS,
+    PAPER_OTHERWISE,
     Grid,
     find_row,
 )
@@ -171,11 +172,15 @@ def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
-    """B, the potential, how flat policies learn, annealing, interleaving, the ant: rows side by side, three metrics."""
+    """B, k, the potential, flat policies' learning, annealing, interleaving, the ant: rows side by side."""
     tasks = [row for grid in _COMPARED_GRIDS if "walker" not in grid.base for row in grid.points().values()]
     walkers = [row for grid in _COMPARED_GRIDS if "walker" in grid.base for row in grid.points().values()]
     lines = (
-        ("B, the potential, how flat policies learn: masters, flat policies", tasks, ("way", "route", "success")),
+        (
+            "B, k, the potential, how flat policies learn: masters, flat policies",
+            [*tasks, *_OTHERWISE],
+            ("way", "route", "success"),
+        ),
         (
             "B, the entropy bonus, annealing, parts of interleaving, the ant: sub-policies",
             [*walkers, *_ANNEALED, *_WITHOUT, _WITH_BONUS, *(row for row in _OF_ANTS if find_row(row).is_walker)],
@@ -218,6 +223,12 @@ _ANNEALED_MASTERS = tuple(
     if "/maze/" in one.name
     for row in (one.name.removeprefix("ablation/").replace("-annealed", ""), one.name)
 )
+_OTHERWISE = tuple(
+    row
+    for one in PAPER_OTHERWISE
+    for _, place, _, kind in (one.name.split("/"),)
+    for row in (f"{place}/paper/{kind}", one.name)
+)
 _WITHOUT = ("walker/interleaved", *(row.name for row in INTERLEAVED_WITHOUT))
 _WITHOUT_MASTERS = (
     "maze/hrl/interleaved",
@@ -228,6 +239,7 @@ COMPARED: tuple[str, ...] = tuple(
     dict.fromkeys(
         (
             *(row for grid in _COMPARED_GRIDS for row in grid.points().values()),
+            *_OTHERWISE,
             *_ANNEALED,
             *_ANNEALED_MASTERS,
             *_WITHOUT,

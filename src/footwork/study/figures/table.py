@@ -236,7 +236,7 @@ FIGURES: tuple[Figure, ...] = (
     ),
     Figure(
         "19-choices",
-        "What the paper leaves open: B, the potential, bonus and annealing, the ant; and parts of interleaving",
+        "What the paper leaves open: B, k, the potential, bonus and annealing, the ant; and parts of interleaving",
         "IQM over seeds with 95 % intervals; in brackets the number of seeds. There are walls to go around on AntMaze "
         "only. The entropy bonus is 0.02 where a name does not say otherwise (annealed and interleaved ones begin with "
         "it), but for the light ant's sub-policies, which have none. Flat policies: their log-deviation "

@@ -294,6 +294,12 @@ def test_an_accelerator_is_left_alone_but_by_the_engine_that_computes_on_it(monk
 
     monkeypatch.setenv("JAX_PLATFORMS", "")  # so that it is put back afterwards
     assert platforms("train", "walker/plain") == "cpu"
+    assert platforms("train", "walker/plain", "--runs", "/data/mjx-study", "--name", "no-mjx") == "cpu"
     assert platforms("train", "walker/plain", theirs="cuda") == "cuda"
-    for named in (("walker/plain", "--engine", "mjx"), ("walker/plain", "--engine=mjx"), ("mjx/walker/plain",)):
+    for named in (
+        ("walker/plain", "--engine", "mjx"),
+        ("walker/plain", "--engine=mjx"),
+        ("mjx/walker/plain",),
+        ("runs/mjx/walker/plain/seed-0",),
+    ):
         assert platforms("train", *named) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -14,7 +15,7 @@ import time
 import pytest
 
 from fake_study import fake_run
-from footwork.record import RunError
+from footwork.record import RunDir, RunError, RunInUse
 from footwork.study import job, sweep
 from footwork.study.measure import measured
 from footwork.study.plan import FULL, Job, Study, plan
@@ -232,6 +233,28 @@ def test_the_board_counts_steps_and_time(stage):
     assert board.seconds_left() == pytest.approx(left / (board.steps_done() / 100), rel=0.01)
     assert sweep.board_table(board).row_count == 1
     assert "0 of 8 runs done, 1 running" in board.line()
+
+
+def test_a_job_waits_for_whoever_measures_its_finished_run(tmp_path, monkeypatch):
+    """Of a run with several seeds one job measures all; those of the other seeds are done when that is."""
+    study = Study(tmp_path, FULL)
+    fake_run(study, "maze/flat/free", 0)
+    tries = []
+
+    def lock_of_another(run):
+        tries.append(run.path)
+        if len(tries) < 3:
+            raise RunInUse("in use")
+        return contextlib.nullcontext()
+
+    monkeypatch.setattr(RunDir, "lock", lock_of_another)
+    monkeypatch.setattr(job, "_end_with_parent", lambda: None)
+    monkeypatch.setattr(job, "WAIT_FOR_LOCK", -1.0)
+    describe = lambda seed: [json.dumps({**sweep._as_json(study), "row": "maze/flat/free", "seed": seed})]  # noqa: E731
+    assert job.main(describe(0)) == 0
+    assert len(tries) == 3
+    tries.clear()
+    assert job.main(describe(1)) == 1  # of an unfinished run somebody else is the trainer
 
 
 def test_seed_i_stands_on_seed_i(tmp_path, monkeypatch):

@@ -52,21 +52,21 @@ def main():
         actions = jax.numpy.asarray(actions)  # on the device already, as a policy's are
     hold = loop_over(physics, lambda carry, _: ((physics.step(carry[0], carry[1]), carry[1]), None))
 
-    def episode(state):
+    def episode():
+        state = physics.initial()
         for action in actions:
             (state, _), _ = hold((state, action), np.arange(HOLD))
         jax.block_until_ready(state)
         return PUT_BACK * asked.rows
 
-    start = physics.initial()
-    jax.block_until_ready(hold((start, actions[0]), np.arange(HOLD)))
+    jax.block_until_ready(hold((physics.initial(), actions[0]), np.arange(HOLD)))
     compiled, rates = time.perf_counter() - begun, []
     with turn(asked.lock):
-        episode(start)
+        episode()
         for _ in range(ROUNDS):
             begun, steps = time.perf_counter(), 0
             while (spent := time.perf_counter() - begun) < ROUND_SECONDS:
-                steps += episode(start)
+                steps += episode()
             rates.append(steps / spent)
     physics.close()
     device = jax.devices()[0]

@@ -426,6 +426,11 @@ def versions() -> dict[str, str]:
     return {**found, "platform": system}
 
 
+def device_in(versions: Mapping[str, str]) -> str:
+    """What a run was computed on. Runs that do not say were made before GPUs were seen, or on the CPU."""
+    return versions.get("device", "the CPU")
+
+
 @functools.cache
 def source_digest() -> str:
     """Eight digits that change with any line of the package's Python code: two checkouts of one version differ."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -64,9 +65,10 @@ def leave_accelerators(arguments: list[str]) -> None:
     """Have JAX compute on the CPU, on a machine with a GPU too, unless the command names the engine that runs there.
 
     The other engines step ants from the host, many small calls a step: a GPU between them would slow all of it, and be
-    taken from others. ``JAX_PLATFORMS``, JAX's own variable, goes before.
+    taken from others. An address, a folder or ``--engine`` may name it; ``JAX_PLATFORMS``, JAX's own variable, goes
+    before.
     """
-    if not any("mjx" in argument for argument in arguments):  # --engine mjx, mjx/walker/plain, runs/mjx/...
+    if not any("mjx" in re.split("[/=]", argument) for argument in arguments):
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 

@@ -18,6 +18,7 @@ from footwork.study.experiments import (
     GRIDS_BY_NAME,
     INTERLEAVED_WITHOUT,
     INTERLEAVED_WITHOUT_MASTERS,
+    PAPER_MASTERS_VARIED,
     in_braces,
     is_row,
 )
@@ -80,6 +81,11 @@ def _grid(metric: str, *names: str) -> tuple[Shown, ...]:
 
 def _rows(metric: str, *rows: str) -> Shown:
     return Shown(metric, tuple((row, row) for row in rows))
+
+
+def _varied(place: str) -> list[str]:
+    """Masters with the paper's reward on its own kinds, with k = 200 on AntMaze, with B as a size on AntBandit."""
+    return [row.name for row in PAPER_MASTERS_VARIED if f"/{place}/" in row.name]
 
 
 _LENGTHS = tuple(f"ablation/{kind}/t" for kind in PAPER_REGULARISERS)
@@ -151,7 +157,10 @@ ANSWERS: tuple[Answer, ...] = (
         "4",
         "k is a hyperparameter (not stated)",
         figures=(13,),
-        shows=_grid("success", "ablation/bandit/k", "ablation/maze/k", "ablation/maze/k-paper"),
+        shows=(
+            *_grid("success", "ablation/bandit/k", "ablation/maze/k", "ablation/maze/k-paper"),
+            _rows("success", *_varied("maze")),
+        ),
         built="k = 50, and a grid around it",
     ),
     Answer(
@@ -204,6 +213,7 @@ ANSWERS: tuple[Answer, ...] = (
         shows=(
             *_grid("return", "ablation/walker/B-as-size"),
             *_grid("way", "ablation/bandit/B-as-size", "ablation/maze/B-as-size"),
+            _rows("way", *_varied("bandit")),
         ),
         built="a number; 32 as a size is an ablation",
     ),

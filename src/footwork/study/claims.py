@@ -176,17 +176,17 @@ def _serves_better(place: str) -> tuple[Contrast, ...]:
     return _shown_too(others[:1]) + others[1:]
 
 
-def _shown(contrasts: Iterable[Contrast], how: str) -> tuple[Contrast, ...]:
+def _only_shown(contrasts: Iterable[Contrast], how: str) -> tuple[Contrast, ...]:
     """Comparisons of rows that differ from the study's in one field: shown, where there are such rows."""
     return tuple(replace(c, words=f"{c.words}, {how}", decides=False) for c in _shown_too(tuple(contrasts)))
 
 
 # Masters with the paper's reward on AntMaze and longer options, and on AntBandit with B read as a size.
-_LONG, _AS_SIZE = "ablation/maze/{schedule}-k-200", "ablation/bandit/{schedule}-B-as-size"
+_LONG, _AS_SIZE = "ablation/maze/k-{schedule}-200", "ablation/bandit/B-as-size-{schedule}"
 
 
 def _long_options_beat_flat() -> tuple[Contrast, ...]:
-    return _shown(
+    return _only_shown(
         (
             _way(f"{name}against flat, {flat}", f"{_LONG}/{kind}", f"maze/flat/{{guided}}{flat}")
             for kind, name in (("appropriate-bias", ""), ("plain", "on plain sub-policies, "))
@@ -197,7 +197,7 @@ def _long_options_beat_flat() -> tuple[Contrast, ...]:
 
 
 def _serves_better_otherwise(group: str, how: str) -> tuple[Contrast, ...]:
-    return _shown(
+    return _only_shown(
         (_way(f"{kind} against plain", f"{group}/{kind}", f"{group}/plain") for kind in reversed(PAPER_REGULARISERS)),
         how,
     )
@@ -291,7 +291,7 @@ CLAIMS: tuple[Claim, ...] = (
         7,
         "Regularised sub-policies serve the master better on AntBandit.",
         "8, Figure 9",
-        _serves_better("bandit") + _serves_better_otherwise(_AS_SIZE, "B a size"),
+        _serves_better("bandit") + _serves_better_otherwise(_AS_SIZE, "B as a size"),
         everywhere=True,
     ),
     Claim(
@@ -405,7 +405,7 @@ CLAIMS: tuple[Claim, ...] = (
                     for kind in PAPER_REGULARISERS
                 )
             ),
-            *_shown(
+            *_only_shown(
                 (
                     _way(f"maze, against {kind}", "ablation/maze/k-{schedule}/200", f"{_LONG}/{kind}")
                     for kind in PAPER_REGULARISERS

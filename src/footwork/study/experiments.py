@@ -286,11 +286,11 @@ def _masters_on(rows: Iterable[Experiment], kind: str | None = None) -> tuple[Ex
 
 # The grids of k and B vary masters on interleaved sub-policies. The paper's own kinds where that mattered: an option so
 # long that masters with the paper's reward got past the wall, and B = 32 as a size on AntBandit.
-PAPER_OTHERWISE: tuple[Experiment, ...] = tuple(
+PAPER_MASTERS_VARIED: tuple[Experiment, ...] = tuple(
     replace(_with_field(MAIN[f"{group}/{kind}"], field, value), name=f"{name}/{kind}")
     for name, group, field, value in (
-        ("ablation/maze/paper-k-200", "maze/paper", "option_steps", 200),
-        ("ablation/bandit/paper-B-as-size", "bandit/paper", "ppo.minibatch_size", 32),
+        ("ablation/maze/k-paper-200", "maze/paper", "option_steps", 200),
+        ("ablation/bandit/B-as-size-paper", "bandit/paper", "ppo.minibatch_size", 32),
     )
     for kind in KINDS[:4]
 )
@@ -345,7 +345,7 @@ LIGHT_WITH_BONUS = _of_robot(
 EXPERIMENTS: dict[str, Experiment] = {
     **MAIN,
     **{row.name: row for grid in GRIDS for row in grid.rows()},
-    **{row.name: row for row in PAPER_OTHERWISE},
+    **{row.name: row for row in PAPER_MASTERS_VARIED},
     **{row.name: row for row in (*ANNEALED, *ANNEALED_MASTERS, *INTERLEAVED_WITHOUT, *INTERLEAVED_WITHOUT_MASTERS)},
     **{row.name: row for row in (*(_of_robot(row, ROBOTS["light"]) for row in LIGHT), LIGHT_WITH_BONUS)},
 }

@@ -110,8 +110,8 @@ def main(arguments: list[str]) -> int:
         except Interrupted as error:
             print(error, file=sys.stderr)
             return STOPPED
-        except RunInUse as error:
-            if time.monotonic() > deadline:
+        except RunInUse as error:  # of a finished run with several seeds another process measures all of them
+            if time.monotonic() > deadline and find_run(study, asked["row"], asked["seed"]) is None:
                 return _failed(error)
             time.sleep(0.5)
         except (ValueError, OSError, TrainingDiverged) as error:

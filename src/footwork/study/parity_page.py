@@ -134,7 +134,7 @@ def _transfer(found: dict[str, Any]) -> Iterable[str]:
 
 def _speed(found: dict[str, Any]) -> Iterable[str]:
     yield "## Control steps per second on this machine's processor"
-    yield "Alternating rounds, all cores; median, least and largest; ratios within rounds. On a GPU: not measured."
+    yield "Alternating rounds, all cores; median, least and largest; ratios within rounds. Nothing here ran on a GPU."
     yield _table(
         "ant",
         {

@@ -132,8 +132,8 @@ def _reading() -> tuple[str, ...]:
 def _rows_read(results: Results) -> str:
     return (
         "Interquartile means over seeds with 95 % intervals. Control steps: of one run, all its directions counted. "
-        "Minutes: of training, mean over seeds, one core each (seeds that trained side by side have an equal share of "
-        "their time), without the measuring that follows "
+        "Minutes: of training, mean over seeds, on one core in the sweep (seeds that trained side by side have an "
+        "equal share of their time), without the measuring that follows "
         f"({results.study.size.episodes} episodes, drawn from the policy and not its mean, or the hand-over matrix and "
         "random switching). Hand-overs: orthogonal ones that succeed; m/s after: along the new direction, after "
         "failed ones too. Idle, upside down: options that gain less than "
@@ -324,7 +324,7 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     steps, seconds = 0, 0.0
     for row in rows:
         samples = results.samples(row)
-        by_count.setdefault(len(samples), []).append(row)
+        by_count.setdefault(max((sample.seed + 1 for sample in samples), default=0), []).append(row)
         for sample in samples:
             steps += sample.control_steps
             for name, version in sample.run.versions().items():
@@ -335,16 +335,19 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     machine = read_machine(results.study.runs) or "not recorded"
     here = f"footwork {footwork.__version__}, Python {platform.python_version()}"
     quick = "" if results.study.size.short is None else " --quick"
-    made = [f"footwork reproduce{quick} --rows {in_braces(group)} --seeds {n}" for n, group in sorted(by_count.items())]
-    made += [
-        f"footwork train {row} --seeds {' '.join(map(str, seeds))}  # side by side, before the others"
+    made = [
+        f"footwork train {row} --seeds {' '.join(map(str, seeds))}{_length(results, row)}  # side by side"
         for row in rows
-        for seeds in _side_by_side(results, row)
+        for seeds in _trained_together(results, row)
+    ]
+    made += [
+        f"footwork reproduce{quick} --rows {in_braces(group)} --seeds {n}"
+        for n, group in sorted(by_count.items(), reverse=True)
     ]
     again = "footwork report --runs results --to .  # in this folder: the same report from the files beside it"
     return [
         Text("The runs that are in it (seeds 0, 1, ... of each row):"),
-        Code("\n".join(reversed(made))),
+        Code("\n".join(made)),
         Text("The report:"),
         Code(f"{command}\n{again}"),
         Text(
@@ -355,12 +358,16 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     ]
 
 
-def _side_by_side(results: Results, row: str) -> list[list[int]]:
-    """The seeds of a row that one run trained together, run by run."""
-    together: dict[Path, list[int]] = {}
-    for sample in results.samples(row):
-        together.setdefault(sample.run.path, []).append(sample.seed)
-    return [seeds for seeds in together.values() if len(seeds) > 1]
+def _trained_together(results: Results, row: str) -> list[list[int]]:
+    """The seeds of each run of a row that trained several."""
+    runs = {sample.run.path: sample.run.config()["seeds"] for sample in results.samples(row)}
+    return [seeds for seeds in runs.values() if len(seeds) > 1]
+
+
+def _length(results: Results, row: str) -> str:
+    """What a command for a run of a study in small says besides."""
+    study = results.study
+    return "" if study.size.short is None else f" --total-steps {study.row(row).total_steps} --runs {study.runs.name}"
 
 
 __all__ = ["report_blocks", "write_report"]

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from footwork.physics import libraries_of
-from footwork.record import RunDir, RunError, config_from_json
+from footwork.record import RunDir, RunError, config_from_json, device_in
 from footwork.statistics import Effect, Floats, contrast, generator_for
 from footwork.study.experiments import EXPERIMENTS, MAIN, is_row
 from footwork.study.measure import EVALUATION, problem_with
@@ -220,14 +220,14 @@ def strays(study: Study) -> list[str]:
 
 
 def _mixed_versions(row: str, samples: tuple[Sample, ...]) -> list[str]:
-    """Runs of one row that other code or libraries made count all the same; it is said."""
+    """Runs of one row that other code, libraries or devices made count all the same; it is said."""
     problems = []
     engines = {sample.experiment.engine for sample in samples}
     for library in ("footwork", "source", *dict.fromkeys(name for engine in engines for name in libraries_of(engine))):
         found = sorted({str(sample.run.versions().get(library, "unknown")) for sample in samples})
         if len(found) > 1:
             problems.append(f"runs of {row} were made with different versions of {library}: {', '.join(found)}")
-    devices = sorted({str(sample.run.versions().get("device", "the CPU")) for sample in samples})
+    devices = sorted({device_in(sample.run.versions()) for sample in samples})
     if len(devices) > 1:
         problems.append(f"runs of {row} were made on different devices: {', '.join(devices)}")
     return problems

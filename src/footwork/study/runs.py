@@ -25,7 +25,7 @@ import jax
 from footwork import checkpoint
 from footwork.checkpoint import CheckpointError
 from footwork.physics import libraries_of, require_engine
-from footwork.record import RunDir, RunError, config_from_json, config_to_json, versions
+from footwork.record import RunDir, RunError, config_from_json, config_to_json, device_in, versions
 from footwork.study.experiments import find_row, is_row, with_robot
 from footwork.train import Experiment, Trained, planned_steps, policy_meta, train
 
@@ -135,9 +135,12 @@ def _reopen(path: Path, config: dict[str, Any], experiment: Experiment) -> RunDi
             raise ValueError(
                 f"{path} was begun with {name} {then[name]}, this is {now.get(name)}: use that, or begin anew"
             )
-    before, here = (found.get("device", "the CPU") for found in (then, now))
+    before, here = device_in(then), device_in(now)
     if before != here:
-        raise ValueError(f"{path} was begun on {before}, JAX computes on {here} now: use that, or begin anew")
+        raise ValueError(
+            f"{path} was begun on {before}, JAX computes on {here} now: set JAX_PLATFORMS to where it was begun "
+            f"(cuda, cpu), or begin anew"
+        )
     return run
 
 

@@ -27,7 +27,7 @@ class Curve(NamedTuple):
     """A run's training in :data:`BINS` bins of equally many updates; arrays [X] or [X, R], R learners of the run."""
 
     step: Floats  # control steps of one learner at the end of each bin
-    seconds: Floats  # of training, at the end of each bin
+    seconds: Floats  # of training, at the end of each bin: of the whole run, or of a seed an equal share of that
     episodes: Floats  # that ended in the bin
     values: dict[str, Floats]  # mean over these episodes, NaN where none ended; "success" is a share
 

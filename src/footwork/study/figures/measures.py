@@ -19,7 +19,7 @@ from footwork.study.experiments import (
     INTERLEAVED_WITHOUT,
     INTERLEAVED_WITHOUT_MASTERS,
     LIGHT_WITH_BONUS,
-    PAPER_OTHERWISE,
+    PAPER_MASTERS_VARIED,
     Grid,
     find_row,
 )
@@ -178,7 +178,7 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
     lines = (
         (
             "B, k, the potential, how flat policies learn: masters, flat policies",
-            [*tasks, *_OTHERWISE],
+            [*tasks, *_VARIED],
             ("way", "route", "success"),
         ),
         (
@@ -223,9 +223,9 @@ _ANNEALED_MASTERS = tuple(
     if "/maze/" in one.name
     for row in (one.name.removeprefix("ablation/").replace("-annealed", ""), one.name)
 )
-_OTHERWISE = tuple(
+_VARIED = tuple(
     row
-    for one in PAPER_OTHERWISE
+    for one in PAPER_MASTERS_VARIED
     for _, place, _, kind in (one.name.split("/"),)
     for row in (f"{place}/paper/{kind}", one.name)
 )
@@ -239,7 +239,7 @@ COMPARED: tuple[str, ...] = tuple(
     dict.fromkeys(
         (
             *(row for grid in _COMPARED_GRIDS for row in grid.points().values()),
-            *_OTHERWISE,
+            *_VARIED,
             *_ANNEALED,
             *_ANNEALED_MASTERS,
             *_WITHOUT,

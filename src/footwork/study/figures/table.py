@@ -241,8 +241,9 @@ FIGURES: tuple[Figure, ...] = (
         "only. k-paper-200, B-as-size-paper: the paper's reward and schedule with options of 200 control steps, with "
         "minibatches of 32. The entropy bonus is 0.02 where a name does not say otherwise (annealed and interleaved "
         "ones begin with it), but for the light ant's sub-policies, which have none. Flat policies: their "
-        "log-deviation capped at 0.5 instead of 2.0; bonus and step falling over all their updates (4882). Interleaved ones without "
-        "cooperation: returns leave out the chance of a hand-over and what the ant would then be worth to the others.",
+        "log-deviation capped at 0.5 instead of 2.0; bonus and step falling over all their updates (4882). Interleaved "
+        "ones without cooperation: returns leave out the chance of a hand-over and what the ant would then be worth to "
+        "the others.",
         measures.comparisons,
         measures.COMPARED,
         once=True,

@@ -192,8 +192,9 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
             ("way", "route", "success"),
         ),
     )
-    figure, axes = panels(3, 3, 2.2)
-    axes[0, 0].get_gridspec().set_height_ratios([len(set(names)) + 2 for _, names, _ in lines])
+    heights = [len(set(names)) + 2 for _, names, _ in lines]
+    figure, axes = panels(3, 3, 0.16 * sum(heights) / 3)  # inches, so that no name touches the next
+    axes[0, 0].get_gridspec().set_height_ratios(heights)
     for line, (title, names, metrics) in zip(axes, lines, strict=True):
         for ax, metric in zip(line, metrics, strict=True):
             _dots(ax, results, metric, list(dict.fromkeys(names)), named=ax is line[0])

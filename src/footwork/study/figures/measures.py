@@ -193,7 +193,7 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
         ),
     )
     heights = [len(set(names)) + 2 for _, names, _ in lines]
-    figure, axes = panels(3, 3, 0.16 * sum(heights) / 3)  # inches, so that no name touches the next
+    figure, axes = panels(3, 3, round(0.16 * sum(heights) / 3, 1))  # inches, so that no name touches the next
     axes[0, 0].get_gridspec().set_height_ratios(heights)
     for line, (title, names, metrics) in zip(axes, lines, strict=True):
         for ax, metric in zip(line, metrics, strict=True):

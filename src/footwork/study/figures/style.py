@@ -116,6 +116,7 @@ def save(figure: Any, path: Path, note: str = "") -> list[Path]:
     """Write PNG and SVG beside each other; a note (of a small study) stands on the figure itself."""
     if note:
         figure.text(1.0, 1.015, note, ha="right", va="bottom", fontsize=8, color="#B00020", weight="bold")
+    _freeze_layout(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
     for file, style in ((png, {"dpi": DPI, "metadata": {"Software": None}}), (svg, {"metadata": {"Date": None}})):
@@ -124,6 +125,17 @@ def save(figure: Any, path: Path, note: str = "") -> list[Path]:
         write_atomically(file, content.getvalue())
     plt.close(figure)
     return [png, svg]
+
+
+def _freeze_layout(figure: Any) -> None:
+    """Lay the figure out once and round where its axes are.
+
+    The layout's solver leaves last digits that differ from one process to the next, and an SVG's names follow them.
+    """
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for ax in figure.axes:
+        ax.set_position([round(number, 6) for number in ax.get_position(original=True).bounds])
 
 
 def legend_below(figure: Any, axes: Sequence[Any], columns: int = 3) -> None:

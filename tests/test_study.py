@@ -293,7 +293,7 @@ def test_seeds_that_trained_side_by_side_count_as_they_would_alone(study):
     assert together.scores_by_seed(row, "way") == ways
     for (_, one), (sample, other) in zip(curves, together.curves(row), strict=True):
         np.testing.assert_array_equal(one.values["progress"], other.values["progress"])
-        if sample.seed:  # three seeds in the time of a half as many: half the time each
+        if sample.seed:  # at twice the rate, each takes half of what it would alone
             np.testing.assert_allclose(other.seconds[-1], curves[1][1].seconds[-1] / 2, rtol=1e-2)
     assert together.training_seconds(row)[0] == seconds[0]
     assert not together.problems
@@ -558,6 +558,17 @@ def test_a_report_of_nothing_is_refused_with_the_reasons(study, tmp_path, capsys
     said = capsys.readouterr()
     assert "no finished run of any row counts in" in said.err
     assert "seed-0 is not finished" in said.out
+
+
+def test_a_figure_is_saved_with_its_layout_rounded(tmp_path):
+    """The last digits of a layout differ between processes, and an SVG names its parts after them."""
+    figure, axes = style.panels(3, 3, 3.3)
+    for ax in axes.flat:
+        ax.set_xlabel("a label\nof two lines")
+    style.save(figure, tmp_path / "figure")
+    places = np.array([ax.get_position(original=True).bounds for ax in figure.axes])
+    np.testing.assert_allclose(places, places.round(6), rtol=0, atol=1e-12)
+    assert len(np.unique(places[:, 0])) == 3  # laid out, not piled up
 
 
 def test_every_comparison_has_rows_in_some_setting():

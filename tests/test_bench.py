@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -303,3 +305,14 @@ def test_an_accelerator_is_left_alone_but_by_the_engine_that_computes_on_it(monk
         ("runs/mjx/walker/plain/seed-0",),
     ):
         assert platforms("train", *named) is None
+
+
+@pytest.mark.parametrize("platforms", ["cuda", "nonsense"])
+def test_a_device_that_jax_does_not_find_is_one_line(platforms, tmp_path):
+    if platforms == "cuda" and importlib.util.find_spec("jax_plugins"):
+        pytest.skip("JAX has CUDA here")
+    command = [sys.executable, "-m", "footwork", "train", "walker/plain", "--runs", str(tmp_path)]
+    done = subprocess.run(command, env={**os.environ, "JAX_PLATFORMS": platforms}, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(f"footwork: JAX_PLATFORMS is {platforms!r}")
+    assert "Traceback" not in done.stderr

@@ -98,6 +98,10 @@ def run(arguments: list[str]) -> int:
         sys.stderr.close()
         return 0
     except Exception as error:
+        if _device_is_missing(error):
+            platforms = os.environ["JAX_PLATFORMS"]
+            print(f"footwork: JAX_PLATFORMS is {platforms!r}: JAX finds no such device here; unset it", file=sys.stderr)
+            return 1
         if not _is_for_the_user(error):
             raise
         print(f"footwork: {error}", file=sys.stderr)
@@ -109,3 +113,16 @@ def _is_for_the_user(error: Exception) -> bool:
 
     stopped = isinstance(error, Interrupted | TrainingDiverged) or type(error).__name__ == "SweepStopped"
     return stopped or isinstance(error, ValueError | OSError | ImportError)
+
+
+def _device_is_missing(error: Exception) -> bool:
+    """Whether JAX failed for want of the device that ``JAX_PLATFORMS`` asks for: asked again, it fails again."""
+    if not (os.environ.get("JAX_PLATFORMS") and isinstance(error, AssertionError | RuntimeError)):
+        return False
+    import jax
+
+    try:
+        jax.devices()
+    except (AssertionError, RuntimeError):  # the first where JAX was built without it
+        return True
+    return False

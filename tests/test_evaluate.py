@@ -126,6 +126,27 @@ def test_the_matrix_names_first_and_second(glider):
     assert len(direction) >= changes.max() + 300
 
 
+def test_where_ants_are_large_the_matrix_takes_no_more_at_once_than_switching_does(monkeypatch):
+    """One first direction after the other, each with noise of its own; the numbers are the same where there is none."""
+    sizes, keys, walk = [], [], evaluating._Walk
+
+    def watched(env, key):
+        keys.append(tuple(jax.random.key_data(key).tolist()))
+        return walk(env, key)
+
+    def glide(engine, robot, arena, num_envs, num_threads):
+        sizes.append(num_envs)
+        return Glider(robot, arena, num_envs, num_threads)
+
+    monkeypatch.setattr(evaluating, "physics_for", glide)
+    monkeypatch.setattr(evaluating, "_Walk", watched)
+    subs = walkers(np.array([2.0, 1.5, 1.0, 0.5]), flips=[2], lies_down=[3])
+    matrices = [handover_matrix(subs, ANT_WALKER, ants=2, seed=1, engine=engine) for engine in ("mujoco", "bullet")]
+    assert sizes == [32, 8, 8, 8, 8]
+    assert len(set(keys)) == 5
+    assert matrices[0] == matrices[1]
+
+
 @pytest.mark.parametrize("orthogonal", [False, True])
 def test_random_switching_counts_what_each_option_did(glider, monkeypatch, orthogonal):
     monkeypatch.setattr(evaluating, "SWITCHING_STEPS", 500)

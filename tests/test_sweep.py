@@ -200,6 +200,36 @@ def test_two_sweeps_do_not_share_cores(monkeypatch, tmp_path):
         assert more_than_there_are == [None] * 4
 
 
+@pytest.mark.parametrize(("runs_of_room", "most"), [(0.5, 1), (1.9, 1), (2.1, 2), (None, 2)])
+def test_no_more_runs_at_once_than_memory_holds(stage, monkeypatch, runs_of_room, most):
+    monkeypatch.setenv("STAND_IN_SECONDS", "0.3")
+    need = sweep.megabytes_of(stage.study, stage.jobs[0])
+    monkeypatch.setattr(sweep, "free_megabytes", lambda: None if runs_of_room is None else runs_of_room * need)
+    begin, at_once = sweep._start, []
+
+    def start(board_study, *rest):
+        worker = begin(board_study, *rest)
+        workers.append(worker.process)
+        at_once.append(sum(process.poll() is None for process in workers))
+        return worker
+
+    workers = []
+    monkeypatch.setattr(sweep, "_start", start)
+    board = stage.run(workers=2)
+    assert len(board.done) == len(stage.jobs)
+    assert max(at_once) == most
+    assert any("not enough memory" in line for line in stage.said) == (most < 2)
+
+
+def test_runs_of_large_ants_need_more_memory():
+    def gigabytes(row):
+        return sweep.megabytes_of(Study("runs", FULL), Job(row, 0, None, 1)) / 1e3
+
+    assert 4 < gigabytes("bullet/walker/plain") < 6  # 128 ants
+    assert 6 < gigabytes("bullet/maze/hrl/plain") < 8  # 200 episodes at once
+    assert gigabytes("walker/plain") == gigabytes("maze/hrl/plain") < 1
+
+
 def test_what_earlier_sweeps_did_is_not_this_ones_speed(stage):
     one, other = stage.jobs[0], stage.jobs[1]
     place = run_path(stage.study.runs, one.row, (one.seed,))

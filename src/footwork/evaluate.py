@@ -17,7 +17,7 @@ from footwork.arena import DIRECTIONS, open_field
 from footwork.env import Env, Environment, loop_over, simulate, split_phases
 from footwork.learn.networks import Policy
 from footwork.options import Options, OptionsState, SubPolicies, task_state
-from footwork.physics import DEFAULT_ENGINE, physics_for
+from footwork.physics import DEFAULT_ENGINE, ENGINES, physics_for
 from footwork.regularisers import directions_of_rows
 from footwork.statistics import mean_over_seeds, rate_over_seeds
 from footwork.tasks.task import SUCCESS_RADII, Task
@@ -273,12 +273,10 @@ class _Walk:
         return state, step.events
 
 
-def _walk(
-    sub_policies: SubPolicies, task: Task, num_envs: int, seed: int, num_threads: int, engine: str = DEFAULT_ENGINE
-) -> _Walk:
+def _walk(sub_policies: SubPolicies, task: Task, num_envs: int, key: Key, num_threads: int, engine: str) -> _Walk:
     task = switching_task(task)
     env = Env(task, physics_for(engine, task.robot, task.arena, num_envs, num_threads), (0,) * num_envs)
-    return _Walk(Options(env, sub_policies, _SEGMENT), jax.random.key(seed))
+    return _Walk(Options(env, sub_policies, _SEGMENT), key)
 
 
 def handover_matrix(
@@ -292,24 +290,20 @@ def handover_matrix(
     """Run i for 100 to 200 control steps, then j for 300: entry [i][j] has fall and flip rate and the speed after.
 
     ``ants`` per pair. A fall or flip counts from the hand-over on; the speed is along j over all 300 steps.
-    A hand-over succeeds without either at :data:`HANDOVER_SPEED` or more.
+    A hand-over succeeds without either at :data:`HANDOVER_SPEED` or more. An engine whose ants are large gets one i
+    after the other, each with a key of its own: no more ants at once than :func:`random_switching` with 4 ``ants``.
     """
     pairs = np.repeat(np.arange(_NUM_DIRECTIONS**2, dtype=np.int32), ants)
-    first, second = pairs // _NUM_DIRECTIONS, pairs % _NUM_DIRECTIONS
     low, high = (steps // _SEGMENT for steps in HANDOVER_AFTER)
-    switch = np.random.default_rng(seed).integers(low, high + 1, first.size)
-    fell, flipped = np.zeros_like(first, bool), np.zeros_like(first, bool)
-    at_switch, at_end = np.zeros((first.size, 2)), np.zeros((first.size, 2))
-    with _walk(sub_policies, task, first.size, seed, num_threads, engine) as walk:
-        state, after = walk.start(), HANDOVER_STEPS // _SEGMENT
-        for segment in range(high + after):
-            position = _positions(state)
-            at_switch = np.where(np.equal(segment, switch)[:, None], position, at_switch)
-            state, events = walk.run(state, np.where(segment < switch, first, second), segment)
-            counted = (segment >= switch) & (segment < switch + after)
-            fell = fell | (np.asarray(events["fallen"]) & counted)
-            flipped = flipped | (np.asarray(events["flipped"]) & counted)
-            at_end = np.where(np.equal(segment, switch + after - 1)[:, None], _positions(state), at_end)
+    switch = np.random.default_rng(seed).integers(low, high + 1, pairs.size)
+    key, count = jax.random.key(seed), _NUM_DIRECTIONS if ENGINES[engine].large else 1
+    keys = [key] if count == 1 else [jax.random.fold_in(key, i) for i in range(count)]
+    walks = [
+        _hand_over(_walk(sub_policies, task, some.size, one, num_threads, engine), some, when)
+        for some, when, one in zip(np.split(pairs, count), np.split(switch, count), keys, strict=True)
+    ]
+    fell, flipped, at_switch, at_end = (np.concatenate(parts) for parts in zip(*walks, strict=True))
+    second = pairs % _NUM_DIRECTIONS
     seconds = HANDOVER_STEPS * task.robot.control_dt
     speed = np.sum((at_end - at_switch) * _UNIT[second], axis=1) / seconds
     success = ~fell & ~flipped & (speed >= HANDOVER_SPEED)
@@ -321,6 +315,29 @@ def handover_matrix(
         [{name: float(rates[i, j]) for name, rates in by_pair.items()} for j in range(_NUM_DIRECTIONS)]
         for i in range(_NUM_DIRECTIONS)
     ]
+
+
+def _hand_over(walk: _Walk, pairs: np.ndarray, switch: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Hand over from ``pairs // 4`` to ``pairs % 4`` after ``switch`` segments.
+
+    Returns:
+        Who fell and who flipped after it, [N] each, and where it was and where its steps ended, [N, 2] in m each.
+    """
+    first, second = pairs // _NUM_DIRECTIONS, pairs % _NUM_DIRECTIONS
+    fell, flipped = np.zeros_like(first, bool), np.zeros_like(first, bool)
+    at_switch, at_end = np.zeros((first.size, 2)), np.zeros((first.size, 2))
+    after = HANDOVER_STEPS // _SEGMENT
+    with walk:
+        state = walk.start()
+        for segment in range(HANDOVER_AFTER[1] // _SEGMENT + after):
+            position = _positions(state)
+            at_switch = np.where(np.equal(segment, switch)[:, None], position, at_switch)
+            state, events = walk.run(state, np.where(segment < switch, first, second), segment)
+            counted = (segment >= switch) & (segment < switch + after)
+            fell = fell | (np.asarray(events["fallen"]) & counted)
+            flipped = flipped | (np.asarray(events["flipped"]) & counted)
+            at_end = np.where(np.equal(segment, switch + after - 1)[:, None], _positions(state), at_end)
+    return fell, flipped, at_switch, at_end
 
 
 def random_switching(
@@ -344,7 +361,7 @@ def random_switching(
     generator = np.random.default_rng(seed)
     choice = generator.integers(0, _NUM_DIRECTIONS, ants)
     per_option, speeds = option_steps // _SEGMENT, []
-    with _walk(sub_policies, task, ants, seed, num_threads, engine) as walk:
+    with _walk(sub_policies, task, ants, jax.random.key(seed), num_threads, engine) as walk:
         state = walk.start()
         for option in range(SWITCHING_STEPS // option_steps):
             if option:

@@ -14,6 +14,7 @@ from footwork.robot import Robot
 from footwork.types import Physics
 
 DEFAULT_ENGINE = "mujoco"
+PYBULLET_MEGABYTES = 33  # of an ant's own world; measured, in huge pages
 
 
 class Engine(NamedTuple):
@@ -23,13 +24,21 @@ class Engine(NamedTuple):
     factory: str
     library: str = ""  # that comes with the extra of the same name as the module
     about: str = ""
+    megabytes: int = 0  # that every ant takes; 0: too little to count
+
+    @property
+    def large(self) -> bool:
+        """Whether memory bounds how many ants there can be at once."""
+        return self.megabytes > 0
 
 
 ENGINES: dict[str, Engine] = {
     "mujoco": Engine("batch", "BatchPhysics", about="MuJoCo in C on a thread pool"),
     "mjx": Engine("mjx", "MjxPhysics", "mujoco.mjx", "MuJoCo in JAX, for GPUs"),
-    "bullet": Engine("bullet", "BulletPhysics", "pybullet", "PyBullet, the paper's engine"),
-    "bullet-original": Engine("bullet", "OriginalEnvPhysics", "pybullet", "the same, seen as AntBulletEnv-v0 sees it"),
+    "bullet": Engine("bullet", "BulletPhysics", "pybullet", "PyBullet, the paper's engine", PYBULLET_MEGABYTES),
+    "bullet-original": Engine(
+        "bullet", "OriginalEnvPhysics", "pybullet", "the same, seen as AntBulletEnv-v0 sees it", PYBULLET_MEGABYTES
+    ),
 }
 
 
@@ -37,6 +46,15 @@ def libraries_of(name: str) -> tuple[str, ...]:
     """The distributions whose versions the numbers of a run on this engine depend on."""
     extra = ENGINES[name].library.replace(".", "-")
     return ("jax", "mujoco", *([extra] if extra else []))
+
+
+def free_megabytes() -> float | None:
+    """Memory that programs can still have on this machine; None where that is not known."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            return int(next(line for line in file if line.startswith("MemAvailable:")).split()[1]) / 1e3
+    except (OSError, StopIteration):
+        return None
 
 
 def check_engine(name: str) -> None:

@@ -24,12 +24,12 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from footwork.arena import Arena
+from footwork.physics import PYBULLET_MEGABYTES, free_megabytes
 from footwork.robot import HEAVY, JOINT_NAMES, Robot
 from footwork.types import NUM_FEET, NUM_JOINTS, QPOS_SIZE, QVEL_SIZE, PhysicsState
 
 SHIN_NAMES = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")  # links, in the legs' order
 MAX_WORLDS = 1000  # per process; PyBullet has room for 1024 clients
-WORLD_MEGABYTES = 33  # measured, in huge pages
 NOWHERE = (0.0, 0.0, 1000.0)  # m; touches nothing
 HUGE_PAGES = "glibc.malloc.hugetlb=1"  # for so many worlds: a tenth faster with 128 of them; elsewhere not heeded
 # pybullet_envs: scene_abstract.World, scene_stadium.StadiumScene, robot_bases.MJCFBasedRobot
@@ -224,14 +224,11 @@ def _check_room(num_envs: int, num_workers: int) -> None:
     """Refuse at once what would be killed for want of memory after minutes."""
     if num_envs > MAX_WORLDS * num_workers:
         raise ValueError(f"PyBullet holds {MAX_WORLDS} ants per process, got {num_envs} for {num_workers}")
-    with contextlib.suppress(OSError):  # where there is no such file, nothing is known
-        with open("/proc/meminfo", encoding="ascii") as file:
-            kilobytes = int(next(line for line in file if line.startswith("MemAvailable:")).split()[1])
-        needed, free = num_envs * WORLD_MEGABYTES / 1e3, kilobytes / 1e6
-        if needed > free:
-            raise ValueError(
-                f"{num_envs} ants on engine bullet take {needed:.0f} GB, {free:.0f} are free: ask for fewer"
-            )
+    needed, free = num_envs * PYBULLET_MEGABYTES, free_megabytes()
+    if free is not None and needed > free:
+        raise ValueError(
+            f"{num_envs} ants on engine bullet take {needed / 1e3:.0f} GB, {free / 1e3:.0f} are free: ask for fewer"
+        )
 
 
 class _Shared(NamedTuple):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import math
 import os
 import signal
 import socket
@@ -23,6 +24,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from footwork.physics import ENGINES, free_megabytes
 from footwork.record import RunError
 from footwork.study.job import STOPPED, completed
 from footwork.study.plan import Job, Size, Study
@@ -35,6 +37,7 @@ STOP_WITHIN = 60.0  # s that processes get to end in good order
 LAUNCHERS = ("local", "ray")
 RETRIES = 3  # of a run whose process, or whose node in a cluster, was lost
 _MEASURING = 0.15  # of a run's time, that comes after its last control step
+_MEGABYTES = 800  # of memory that a run takes at most, beside ants that are large
 _TAIL = 1 << 16  # bytes of metrics in which the last whole line lies
 
 
@@ -196,6 +199,14 @@ def steps_of(study: Study, job: Job) -> int:
     return round((1 - _MEASURING) * job.steps * min(1.0, step / planned_steps(row)))
 
 
+def megabytes_of(study: Study, job: Job) -> int:
+    """Memory that a run takes at most, as far as its ants decide it: in training, and when it is measured."""
+    row, size = study.row(job.row), study.size
+    measured = max(size.walker_episodes, size.ants) if row.is_walker else size.episodes
+    ants = max(row.ppo.num_envs * row.runs_per_seed, measured)
+    return _MEGABYTES + ants * ENGINES[row.engine].megabytes
+
+
 # The processes --------------------------------------------------------------------------------------------------------
 
 
@@ -263,8 +274,14 @@ def _run_local(board: Board, workers: int, log: Callable[[str], None]) -> None:
     at_work: dict[int, _Worker] = {}
     try:
         with _signals_stop(), _cores(workers) as cores, _display(board, log) as show:
+            memory, said = free_megabytes(), False
             while len(board.done) + len(board.failed) < len(board.jobs):
-                _start_ready(board, cores, at_work)
+                lacking = _start_ready(board, cores, at_work, memory)
+                if lacking and not said:
+                    log(
+                        f"{lacking.name}, and perhaps others, waits: beside what runs there is not enough memory for it"
+                    )
+                    said = True
                 time.sleep(POLL)
                 _collect_finished(board, at_work, log)
                 show(board)
@@ -299,15 +316,32 @@ def _cores(workers: int) -> Iterator[list[int | None]]:
         yield list(mine) if len(mine) == count else [None] * count
 
 
-def _start_ready(board: Board, cores: Sequence[int | None], at_work: dict[int, _Worker]) -> None:
+def _start_ready(
+    board: Board, cores: Sequence[int | None], at_work: dict[int, _Worker], memory: float | None
+) -> Job | None:
+    """Give every idle core the next run for which there is room beside the others.
+
+    Args:
+        board: knows which runs are ready.
+        cores: one for each place.
+        at_work: by place; those that start are added.
+        memory: MB for all of them; None where it is not known.
+
+    Returns:
+        A run that a core is idle for, but no memory.
+    """
+    room = math.inf if memory is None else memory - sum(megabytes_of(board.study, job) for job in board.active)
     for place, core in enumerate(cores):
         if place in at_work:
             continue
-        job = next(board.ready(), None)
+        ready = list(board.ready())
+        job = next((job for job in ready if not at_work or megabytes_of(board.study, job) <= room), None)
         if job is None:
-            return
+            return ready[0] if ready else None
+        room -= megabytes_of(board.study, job)
         at_work[place] = _start(board.study, job, core, board.study.runs / "cache")
         board.begin(job)
+    return None
 
 
 def _collect_finished(board: Board, at_work: dict[int, _Worker], log: Callable[[str], None]) -> None:

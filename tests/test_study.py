@@ -1097,8 +1097,15 @@ def test_masters_are_set_beside_their_own_sub_policies(study):
     assert association.strength(found, bandit, "light/") is None
     answer = next(answer for answer in answers.ANSWERS if answer.associations)
     text = answers.said(answer, [], found)
-    assert "AntBandit, our reward: -1.00 [-1.00, " in text
-    assert "AntMaze, our reward: no runs that say it" in text
+    assert "AntBandit, our reward (mujoco, heavy ant): -1.00 [-1.00, " in text
+    assert "AntMaze, our reward (mujoco, heavy ant): no runs that say it" in text
+    assert "light ant" not in text  # no runs: nothing to say
+    for seed, quality in enumerate((0.2, 0.5, 0.8)):
+        fake_run(study, "light/walker/plain", seed, quality)
+        fake_run(study, "light/bandit/hrl/plain", seed, quality)
+    text = answers.said(answer, [], results.Results(study))
+    assert "AntBandit, our reward (mujoco, heavy ant): -1.00 [-1.00, " in text
+    assert "AntBandit, our reward (mujoco, light ant): 1.00 [" in text
 
 
 def test_panels_say_how_many_seeds(study):

@@ -22,10 +22,10 @@ from footwork.study.experiments import (
     in_braces,
     is_row,
 )
-from footwork.study.judging import Judgement, show_effect
+from footwork.study.judging import Judgement, engine_and_ant, show_effect
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
-from footwork.study.results import Results, seeds_in_words
+from footwork.study.results import Results, prefixes_at_hand, seeds_in_words
 
 
 @dataclass(frozen=True)
@@ -398,14 +398,20 @@ def said(answer: Answer, judgements: Sequence[Judgement], results: Results) -> s
     lines = [answer.built] if answer.built else []
     lines += [_verdict(j) for j in judgements if j.claim.number in answer.claims]
     lines += [line for shown in answer.shows if (line := _side_by_side(shown, results))]
-    lines += [_associated(association, results) for association in answer.associations]
+    lines += [line for association in answer.associations for line in _associated(association, results)]
     return "\n".join(lines) or "see the figure"
 
 
-def _associated(association: Association, results: Results) -> str:
-    effect = strength(results, association)
-    said = "no runs that say it" if effect is None else f"{effect.estimate:.2f} [{effect.low:.2f}, {effect.high:.2f}]"
-    return f"{association.words}: {said}"
+def _associated(association: Association, results: Results) -> list[str]:
+    """A line for the default engine and ant, and for each other at hand whose runs say it."""
+    lines = []
+    for prefix in prefixes_at_hand(results):
+        effect = strength(results, association, prefix)
+        if prefix and effect is None:
+            continue
+        said = f"{effect.estimate:.2f} [{effect.low:.2f}, {effect.high:.2f}]" if effect else "no runs that say it"
+        lines.append(f"{association.words} ({engine_and_ant(prefix)}): {said}")
+    return lines
 
 
 def _verdict(judgement: Judgement) -> str:

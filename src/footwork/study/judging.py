@@ -198,9 +198,14 @@ def decide(rule: Rule, bound: float, effect: Effect) -> Verdict:
     return "holds" if holds else "does not hold" if fails else "undecided"
 
 
+def engine_and_ant(prefix: str) -> str:
+    """In words, of the rows whose addresses begin so: ``mujoco, light ant``."""
+    experiment = find_row(f"{prefix}walker/plain")
+    return f"{experiment.engine}, {experiment.task.robot.name} ant"
+
+
 def _where(claim: Claim, setting: Setting) -> str:
-    experiment = find_row(f"{setting.prefix}walker/plain")
-    where = f"{experiment.engine}, {experiment.task.robot.name} ant"
+    where = engine_and_ant(setting.prefix)
     return f"{where}, {SCHEDULES[setting.schedule]}" if len(settings_of(claim)) > 1 else where
 
 
@@ -271,6 +276,7 @@ __all__ = [
     "Finding",
     "Judgement",
     "decide",
+    "engine_and_ant",
     "is_reversed",
     "judge_all",
     "no_room",

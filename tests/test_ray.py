@@ -37,8 +37,10 @@ def test_a_lost_node_loses_no_run_and_changes_no_number(tmp_path, monkeypatch):
     )
     local, shared = Study(tmp_path / "local", SMALL), Study(tmp_path / "shared", SMALL)
     jobs = plan(local, ROWS, seeds=2)
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    lost = cluster.add_node(num_cpus=1)
+    room = sweep.megabytes_of(shared, jobs[0]) * 10**6
+    # no node has the memory that a run takes: each runs one all the same
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "memory": room // 2})
+    lost = cluster.add_node(num_cpus=1, memory=room // 2)
     try:
         remover = threading.Thread(target=_remove_when_busy, args=(cluster, lost, shared, jobs))
         remover.start()

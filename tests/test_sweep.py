@@ -230,6 +230,20 @@ def test_runs_of_large_ants_need_more_memory():
     assert gigabytes("walker/plain") == gigabytes("maze/hrl/plain") < 1
 
 
+def test_a_cluster_is_asked_for_no_more_memory_than_a_node_has():
+    study, job = Study("runs", FULL), Job("bullet/walker/plain", 0, None, 1)
+    need = sweep.megabytes_of(study, job) * 10**6
+
+    def node(memory, cores=1.0, alive=True):
+        return {"Alive": alive, "Resources": {"CPU": cores, "memory": float(memory)} if cores else {"memory": memory}}
+
+    assert sweep._memory_to_ask_for(study, job, [node(2 * need), node(3 * need)]) == need
+    assert sweep._memory_to_ask_for(study, job, [node(2 * need), node(need // 2)]) == need // 2
+    assert sweep._memory_to_ask_for(study, job, [node(2 * need), node(9, cores=None), node(9, alive=False)]) == need
+    assert sweep._memory_to_ask_for(study, job, [{"Alive": True, "Resources": {"CPU": 1.0}}]) is None
+    assert sweep._memory_to_ask_for(study, job, []) is None
+
+
 def test_what_earlier_sweeps_did_is_not_this_ones_speed(stage):
     one, other = stage.jobs[0], stage.jobs[1]
     place = run_path(stage.study.runs, one.row, (one.seed,))

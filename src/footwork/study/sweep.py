@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 from itertools import islice
@@ -454,8 +454,9 @@ def board_table(board: Board) -> Any:
 def _run_on_ray(board: Board, workers: int, address: str, log: Callable[[str], None]) -> None:
     """The same processes as tasks of a Ray cluster that shares the folder; Ray decides where they run.
 
-    As many are with Ray as the cluster has cores, so that nodes may come and go. The task of a node that is
-    lost starts again elsewhere, and goes on from the run's checkpoint.
+    As many are with Ray as the cluster has cores, so that nodes may come and go; each says what memory it takes,
+    so that Ray lets those wait for which no node has room. The task of a node that is lost starts again
+    elsewhere, and goes on from the run's checkpoint.
     """
     ray = _connect(address)
     remote = ray.remote(num_cpus=1, max_retries=RETRIES)(run_job)
@@ -466,7 +467,8 @@ def _run_on_ray(board: Board, workers: int, address: str, log: Callable[[str], N
                 places = workers or int(ray.cluster_resources().get("CPU", 0))
                 for job in list(islice(board.ready(), max(0, places - len(at_work)))):
                     asked = (_as_json(board.study), job.row, job.seed, job.steps, job.needs)
-                    at_work[remote.options(name=job.name).remote(*asked)] = job
+                    memory = _memory_to_ask_for(board.study, job, ray.nodes())
+                    at_work[remote.options(name=job.name, memory=memory).remote(*asked)] = job
                     board.begin(job)
                 _collect_tasks(ray, board, at_work, log)
                 show(board)
@@ -474,6 +476,19 @@ def _run_on_ray(board: Board, workers: int, address: str, log: Callable[[str], N
         for reference in at_work:
             ray.cancel(reference, force=True)
         raise _stopped(board) from None
+
+
+def _memory_to_ask_for(study: Study, job: Job, nodes: Iterable[Mapping[str, Any]]) -> int | None:
+    """Bytes, at most what the smallest node with cores has: whichever nodes are lost, there is one that can run it.
+
+    Args:
+        study: the run's.
+        job: the run.
+        nodes: of the cluster, as ``ray.nodes()`` tells them.
+    """
+    there = [node["Resources"] for node in nodes if node["Alive"] and node["Resources"].get("CPU")]
+    smallest = min((resources.get("memory", 0) for resources in there), default=0)
+    return int(min(megabytes_of(study, job) * 10**6, smallest)) or None
 
 
 def _collect_tasks(ray: Any, board: Board, at_work: dict[Any, Job], log: Callable[[str], None]) -> None:

@@ -189,6 +189,7 @@ def test_what_a_replay_refuses():
         (["video", "maze/flat/free", "--speed", "0"], "speed must be > 0 and <= 1000, got 0"),
         (["video", "maze/flat/free", "--speed", "inf"], "speed must be > 0 and <= 1000, got inf"),
         (["video", "maze/flat/free", "-o", "/dev/null/a.webp"], "cannot write /dev/null/a.webp: "),
+        (["replay", "maze/flat/free", "-o", "ant.txt"], "ant.txt does not end in .html"),
         (["replay", "maze/flat/free", "-o", "/"], "cannot write /: it is a directory"),
     ],
 )

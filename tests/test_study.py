@@ -385,7 +385,8 @@ def test_damaged_measurements_are_named_and_how_to_make_them_again(study, damage
     assert len(found.scores("maze/flat/free", "way")) == 0
     (problem,) = found.problems
     assert message in problem
-    assert f"delete {path}, and footwork reproduce --rows maze/flat/free trains it again" in problem  # it has no policy
+    again = f"footwork reproduce --rows maze/flat/free --runs {study.runs}"
+    assert f"delete {path}, and {again} trains it again" in problem  # it has no policy
 
 
 def with_entry(path, **fields):
@@ -472,12 +473,33 @@ def test_a_report_replaces_what_a_report_wrote_and_nothing_else(study, tmp_path,
     assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 1
     assert "results holds something that no report wrote" in capsys.readouterr().err
     (to / "results" / "mine.txt").unlink()
+    (to / "REPORT.md").write_text("my own")
+    assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 1
+    assert "holds REPORT.md, and no report wrote it" in capsys.readouterr().err
+    assert (to / "REPORT.md").read_text() == "my own"
+    (to / "REPORT.md").unlink()
     (study.runs / "walker/plain/seed-1/policy.safetensors").write_bytes(b"torn")  # it is missed, and said, no more
     for _ in range(2):
         assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 0
         assert len(list((to / "results").rglob("DONE"))) == 2
         assert not list(to.glob(".results*"))
         assert "the report's results lack it" in (to / "REPORT.md").read_text()
+
+
+def test_a_report_takes_away_older_figures_and_nobody_elses(study, tmp_path, monkeypatch):
+    fill(study, ("walker/plain",), 1)
+    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
+    figures = tmp_path / "figures"
+    name = f"{FIGURES[0].name}.png"
+    for folder in ("", "light", "mine", "mine/light"):
+        (figures / folder).mkdir(parents=True, exist_ok=True)
+        (figures / folder / name).write_text("before")
+    report.write_report(results.Results(study), tmp_path, "footwork report")
+    assert (figures / "light" / name).exists()  # no report had written there
+    report.write_report(results.Results(study), tmp_path, "footwork report")
+    assert not (figures / "light").exists()
+    assert (figures / name).read_bytes() != b"before"
+    assert (figures / "mine" / name).read_text() == (figures / "mine/light" / name).read_text() == "before"
 
 
 def test_a_report_of_fewer_runs_never_replaces_one_of_more(study, tmp_path, capsys, monkeypatch):
@@ -523,7 +545,9 @@ def test_studies_of_different_sizes_do_not_replace_each_other(study, tmp_path, c
     (tmp_path / "file").touch()
     asked = ["reproduce", "--rows", "walker/plain", "--runs", str(study.runs), "--to", str(tmp_path / "file")]
     assert run(asked) == 1  # before anything is trained
-    assert "cannot write" in capsys.readouterr().err
+    assert "file is a file, and a folder is wanted" in capsys.readouterr().err
+    assert run(["figures", "4", "--runs", str(study.runs), "--to", str(tmp_path / "file")]) == 1
+    assert "file is a file, and a folder is wanted" in capsys.readouterr().err
 
 
 def test_results_that_a_killed_report_had_put_aside_come_back(study, tmp_path, monkeypatch):
@@ -912,13 +936,7 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
     (study.runs / "walker/plain/seed-2/DONE").unlink()
     monkeypatch.setattr(report, "FIGURES", [*FIGURES[:2], *find_figures(["7", "12"])])
     found = results.Results(study)
-    stale, mine = tmp_path / "report/figures/light/12-switching.svg", tmp_path / "report/figures/mine.svg"
-    stale.parent.mkdir(parents=True)
-    for path in (stale, mine):
-        path.write_text("of an earlier report, or nobody's")
     pages = report.write_report(found, tmp_path / "report", "footwork reproduce")
-    assert not stale.parent.exists()
-    assert mine.read_text().startswith("of an")
     text, page = (path.read_text() for path in pages)
     for words in (
         "## Claims",

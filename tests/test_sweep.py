@@ -15,6 +15,7 @@ import time
 import pytest
 
 from fake_study import fake_run
+from footwork.physics import free_megabytes
 from footwork.record import RunDir, RunError, RunInUse
 from footwork.study import job, sweep
 from footwork.study.measure import measured
@@ -230,6 +231,20 @@ def test_runs_of_large_ants_need_more_memory():
     assert gigabytes("walker/plain") == gigabytes("maze/hrl/plain") < 1
 
 
+@pytest.mark.parametrize(
+    ("limit", "free"), [("max\n", 8_000), ("3000000000\n", 2_500), ("90000000000\n", 8_000), (None, 8_000)]
+)
+def test_a_container_has_no_more_memory_than_its_limit(tmp_path, limit, free):
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text("MemTotal: 9765625 kB\nMemAvailable: 7812500 kB\n")
+    for name, text in {"memory.max": limit, "memory.current": "1500000000\n"}.items():
+        if text is not None:
+            (tmp_path / name).write_text(text)
+    (tmp_path / "memory.stat").write_text("anon 500000000\ninactive_file 1000000000\n")
+    assert free_megabytes(meminfo, tmp_path) == free
+    assert free_megabytes(tmp_path / "none", tmp_path) is None
+
+
 def test_a_cluster_is_asked_for_no_more_memory_than_a_node_has():
     study, job = Study("runs", FULL), Job("bullet/walker/plain", 0, None, 1)
     need = sweep.megabytes_of(study, job) * 10**6
@@ -238,8 +253,10 @@ def test_a_cluster_is_asked_for_no_more_memory_than_a_node_has():
         return {"Alive": alive, "Resources": {"CPU": cores, "memory": float(memory)} if cores else {"memory": memory}}
 
     assert sweep._memory_to_ask_for(study, job, [node(2 * need), node(3 * need)]) == need
-    assert sweep._memory_to_ask_for(study, job, [node(2 * need), node(need // 2)]) == need // 2
-    assert sweep._memory_to_ask_for(study, job, [node(2 * need), node(9, cores=None), node(9, alive=False)]) == need
+    assert sweep._memory_to_ask_for(study, job, [node(2 * need), node(need // 2), node(0)]) == need  # not on the small
+    assert sweep._memory_to_ask_for(study, job, [node(need // 2), node(need // 4)]) == need // 2  # the largest tries
+    gone = [node(9 * need, cores=None), node(9 * need, alive=False)]
+    assert sweep._memory_to_ask_for(study, job, [node(need // 2), *gone]) == need // 2
     assert sweep._memory_to_ask_for(study, job, [{"Alive": True, "Resources": {"CPU": 1.0}}]) is None
     assert sweep._memory_to_ask_for(study, job, []) is None
 

@@ -150,6 +150,8 @@ def check_writable(path: Path) -> None:
     """
     if path.is_dir():
         raise CheckpointError(f"cannot write {path}: it is a directory, and the name of a file is wanted")
+    if path.parent.is_file():
+        raise CheckpointError(f"cannot write {path}: {path.parent} is a file, and a folder is wanted")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):

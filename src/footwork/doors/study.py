@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from footwork.checkpoint import check_writable
 from footwork.doors import tables
 from footwork.physics import require_engine
 from footwork.record import RunError
@@ -58,6 +59,7 @@ def figures(names: tuple[str, ...], runs: Path, to: Path, under: str, any_length
     prefix = f"{under.strip('/')}/" if under else ""
     if prefix and not is_row(f"{prefix}walker/plain"):
         raise ValueError(f"there are no rows under {under!r}: there is no {prefix}walker/plain")
+    check_writable(to / f"{chosen[0].name}.png")
     every = draw_figures(results, chosen, to, prefix)
     if not every:
         raise RunError(f"no finished runs under {under!r} of which there are figures in {runs}")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import NamedTuple
 
 from footwork.arena import Arena
@@ -48,13 +49,25 @@ def libraries_of(name: str) -> tuple[str, ...]:
     return ("jax", "mujoco", *([extra] if extra else []))
 
 
-def free_megabytes() -> float | None:
-    """Memory that programs can still have on this machine; None where that is not known."""
+def free_megabytes(meminfo: Path = Path("/proc/meminfo"), cgroup: Path = Path("/sys/fs/cgroup")) -> float | None:
+    """Memory that programs can still have on this machine, or in this container; None where that is not known.
+
+    Args:
+        meminfo: what Linux says of the machine.
+        cgroup: what it says of the container, if this is one (control groups, version 2). Files that were read
+            and not lately looked at are kept in its memory only as long as nobody else wants it.
+    """
     try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            return int(next(line for line in file if line.startswith("MemAvailable:")).split()[1]) / 1e3
+        available = next(line for line in meminfo.read_text("ascii").splitlines() if line.startswith("MemAvailable:"))
+        free = int(available.split()[1]) * 1024 / 1e6
     except (OSError, StopIteration):
         return None
+    try:
+        limit, used = (int((cgroup / name).read_text("ascii")) for name in ("memory.max", "memory.current"))
+        held = dict(line.split() for line in (cgroup / "memory.stat").read_text("ascii").splitlines())
+        return min(free, (limit - used + int(held.get("inactive_file", 0))) / 1e6)
+    except (OSError, ValueError):  # no container, or one without a limit ("max")
+        return free
 
 
 def check_engine(name: str) -> None:

@@ -265,8 +265,11 @@ def show_bound(what: Contrast) -> str:
 
 
 def show_chance(finding: Finding) -> str:
-    """The probability of improvement; of spreads, that a run is farther from the middle of its row."""
-    if finding.probability is None:
+    """The probability of improvement; of spreads, that a run is farther from the middle of its row.
+
+    Of one or two seeds it says nothing beside the effect.
+    """
+    if finding.probability is None or min(finding.seeds) < 3:
         return "-"
     farther = " farther from the middle" if finding.contrast.statistic == "spread" else ""
     return f"{finding.probability:.2f}{farther}"

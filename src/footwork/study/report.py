@@ -15,6 +15,7 @@ from pathlib import Path
 import footwork
 from footwork.checkpoint import write_atomically
 from footwork.evaluate import HANDOVER_AFTER, HANDOVER_SPEED, HANDOVER_STEPS, IDLE_SPEED, SWITCHING_STEPS
+from footwork.physics import ENGINES, libraries_of
 from footwork.record import source_digest
 from footwork.study.answers import ANSWERS, choices, said
 from footwork.study.claims import CLAIMS, Claim
@@ -24,8 +25,8 @@ from footwork.study.judging import Finding, Judgement, judge_all, no_room, show_
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import Block, Bullets, Code, Heading, Picture, TableBlock, Text, markdown, page
 from footwork.study.plan import plan, read_machine
-from footwork.study.report_files import RESULTS, check_place, export
-from footwork.study.results import Results, all_rows, prefixes_at_hand, seeds_in_words
+from footwork.study.report_files import PAGES, REPORT, RESULTS, check_place, export
+from footwork.study.results import Results, all_rows, is_prefix, prefixes_at_hand, seeds_in_words
 from footwork.study.row_tables import side_by_side, side_by_side_caption, sub_policies, task_policies
 from footwork.train import planned_steps, steps_per_iteration
 
@@ -44,28 +45,35 @@ def write_report(results: Results, to: Path, command: str) -> list[Path]:
         CheckpointError: it cannot be written.
     """
     check_place(results.study, to)
+    again = (to / REPORT).is_file()
     prefixes = prefixes_at_hand(results)
     for row in all_rows(results):
         results.samples(row)
     export(results, to / RESULTS)  # first: it may refuse, and may find what is wrong with a file, which the pages say
     drawn = [one for prefix in prefixes for one in draw_figures(results, FIGURES, to / "figures", prefix)]
-    _remove_older_figures(to / "figures", drawn)
+    if again:
+        _remove_older_figures(to / "figures", drawn)
     blocks = report_blocks(results, drawn, command)
-    pages = {"REPORT.md": markdown(blocks, to), "report.html": page(blocks, _title(results))}
+    pages = dict(zip(PAGES, (markdown(blocks, to), page(blocks, _title(results))), strict=True))
     for name, text in pages.items():
         write_atomically(to / name, text.encode())
     return [to / name for name in pages]
 
 
 def _remove_older_figures(place: Path, drawn: Sequence[Drawn]) -> None:
-    """Figures of an earlier report that this one does not draw: of another ant's rows that are no longer there."""
+    """Figures of an earlier report that this one does not draw: of another ant's rows that are no longer there.
+
+    What lies in folders of which a report has none is somebody else's.
+    """
     here = {file for one in drawn for file in one.files}
     known = {figure.name for figure in FIGURES}
-    for path in [*place.rglob("*.png"), *place.rglob("*.svg")]:
-        if path.stem in known and path not in here:
-            path.unlink()
-            if not any(path.parent.iterdir()):
-                path.parent.rmdir()
+    others = [path for path in place.iterdir() if path.is_dir() and is_prefix(f"{path.name}/")]
+    for folder in (place, *others):
+        for path in [*folder.glob("*.png"), *folder.glob("*.svg")]:
+            if path.stem in known and path not in here:
+                path.unlink()
+        if folder != place and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def report_blocks(results: Results, drawn: Sequence[Drawn], command: str) -> list[Block]:
@@ -244,7 +252,7 @@ def _claims_table(judgements: Sequence[Judgement]) -> TableBlock:
 
 def _said(finding: Finding) -> str:
     """A comparison in one line."""
-    chance = "" if finding.probability is None else f", P {show_chance(finding)}"
+    chance = "" if (shown := show_chance(finding)) == "-" else f", P {shown}"
     return f"{finding.contrast.words}: {show_effect(finding)}{chance}, {seeds_in_words(_seeds(finding.seeds))}"
 
 
@@ -313,7 +321,8 @@ def _left_out(results: Results, judgements: Sequence[Judgement], drawn: Sequence
     ]  # those are rows with fewer
     if problems:
         here = f"{results.study.runs}{os.sep}"
-        lines = tuple((problem.replace(here, ""),) for problem in problems)
+        there = f" --runs {results.study.runs}"  # where the report was made says nothing to who reads it elsewhere
+        lines = tuple((problem.replace(here, "").replace(there, ""),) for problem in problems)
         blocks.append(TableBlock(("file or run",), lines))
     return blocks or [Text("Nothing.")]
 
@@ -322,12 +331,16 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
     found: dict[tuple[str, str], int] = {}
     by_count: dict[int, list[str]] = {}
     steps, seconds = 0, 0.0
+    engines = {library for name in ENGINES for library in libraries_of(name)}
     for row in rows:
         samples = results.samples(row)
         by_count.setdefault(max((sample.seed + 1 for sample in samples), default=0), []).append(row)
         for sample in samples:
             steps += sample.control_steps
+            theirs = set(libraries_of(sample.experiment.engine))
             for name, version in sample.run.versions().items():
+                if name in engines - theirs:  # was there, and had no part in it
+                    continue
                 found[name, str(version)] = found.get((name, str(version)), 0) + 1
         seconds += sum(results.training_seconds(row))
     versions = tuple((name, version, str(count)) for (name, version), count in sorted(found.items()))

@@ -18,6 +18,8 @@ from footwork.study.results import Results, Sample, all_rows
 from footwork.study.runs import NEEDED, read_actors
 from footwork.study.training_curves import CURVE, copy_curve
 
+REPORT = "REPORT.md"
+PAGES = (REPORT, "report.html")  # the report itself, twice
 RESULTS = "results"  # folder of a report, with the small files of its runs
 WRITTEN = "WRITTEN_BY_FOOTWORK_REPORT"  # in that folder: the next report may replace it
 
@@ -28,14 +30,14 @@ def check_place(study: Study, to: Path) -> None:
     What a report that was killed in the middle had put aside is brought back first.
 
     Raises:
-        RunError: ``to`` is the folder of runs, or ``to``/results holds the runs, something that no report wrote,
-            another study, or runs that these lack.
+        RunError: ``to`` is the folder of runs, or holds pages that no report wrote, or ``to``/results holds the
+            runs, something that no report wrote, another study, or runs that these lack.
         CheckpointError: nothing can be written there.
     """
     place, runs = to / RESULTS, study.runs
     if runs.resolve() == to.resolve():
         raise RunError(f"{to} is the folder of the runs: choose another --to for the report")
-    checkpoint.check_writable(to / "REPORT.md")
+    checkpoint.check_writable(to / REPORT)
     aside = _beside(place)[1]
     if aside.exists() and not place.exists():
         aside.rename(place)
@@ -43,6 +45,9 @@ def check_place(study: Study, to: Path) -> None:
         return
     if runs.resolve().is_relative_to(place.resolve()):
         raise RunError(f"{place} would be replaced, and the runs in {runs} are in it: choose another --to")
+    foreign = [name for name in PAGES if (to / name).exists()] if not (place / WRITTEN).is_file() else []
+    if foreign:
+        raise RunError(f"{to} holds {foreign[0]}, and no report wrote it (no {place / WRITTEN}): choose another --to")
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return
     if not (place / WRITTEN).is_file():
@@ -160,4 +165,4 @@ def _copy_run(results: Results, sample: Sample, place: Path, row: str, with_poli
             checkpoint.save(place / run.policy_path.name, actors, meta)
 
 
-__all__ = ["RESULTS", "check_place", "export"]
+__all__ = ["PAGES", "REPORT", "RESULTS", "check_place", "export"]

@@ -22,7 +22,7 @@ from footwork.study.experiments import EXPERIMENTS, MAIN, is_row
 from footwork.study.measure import EVALUATION, problem_with
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
-from footwork.study.runs import how_to_train_again
+from footwork.study.runs import how_to_reproduce, how_to_train_again
 from footwork.study.training_curves import Curve, of_seed, read_curve
 from footwork.train import Experiment, planned_steps
 
@@ -157,7 +157,7 @@ class Results:
         if key not in self._files:
             problem = problem_with(sample.run, name, self.study.size)
             if problem:
-                remedy = f"footwork reproduce --rows {sample.row} makes it again"
+                remedy = f"{how_to_reproduce(self.study.runs, sample.row)} makes it again"
                 if not sample.run.policy_path.is_file():  # a report keeps those of some seeds only
                     remedy = how_to_train_again(sample.run, sample.row)
                 self.problems[f"{problem}: {remedy}"] = None
@@ -281,8 +281,13 @@ def prefixes_at_hand(results: Results) -> tuple[str, ...]:
     """The default engine and ant, and those others that have finished runs in the study's folder."""
     runs = results.study.runs
     places = sorted(path.name for path in runs.iterdir() if path.is_dir()) if runs.is_dir() else []
-    there = [f"{name}/" for name in places if any(is_row(f"{name}/{row}") for row in MAIN)]
+    there = [f"{name}/" for name in places if is_prefix(f"{name}/")]
     return ("", *(prefix for prefix in there if any((runs / prefix).rglob("DONE"))))
+
+
+def is_prefix(name: str) -> bool:
+    """Whether rows of another engine or ant have names that begin so, as in ``light/``."""
+    return any(is_row(name + row) for row in MAIN)
 
 
 def all_rows(results: Results) -> list[str]:
@@ -292,4 +297,14 @@ def all_rows(results: Results) -> list[str]:
     return [*EXPERIMENTS, *known]
 
 
-__all__ = ["LeftOut", "Results", "Sample", "all_rows", "find_samples", "prefixes_at_hand", "seeds_in_words", "strays"]
+__all__ = [
+    "LeftOut",
+    "Results",
+    "Sample",
+    "all_rows",
+    "find_samples",
+    "is_prefix",
+    "prefixes_at_hand",
+    "seeds_in_words",
+    "strays",
+]

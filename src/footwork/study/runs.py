@@ -36,7 +36,13 @@ MAX_SEED = 2**31 - 1
 
 def how_to_train_again(run: RunDir, row: str) -> str:
     """What to do about a run of the study that cannot be mended from its own files."""
-    return f"delete {run.path}, and footwork reproduce --rows {row} trains it again"
+    runs = run.path.parents[row.count("/") + 1]
+    return f"delete {run.path}, and {how_to_reproduce(runs, row)} trains it again"
+
+
+def how_to_reproduce(runs: Path, row: str) -> str:
+    """The command that makes whatever is missing of a row."""
+    return f"footwork reproduce --rows {row}" + ("" if runs == Path("runs") else f" --runs {runs}")
 
 
 def run_path(runs: Path, row: str, seeds: tuple[int, ...]) -> Path:
@@ -263,7 +269,7 @@ def find_trained(address: str, runs: Path) -> Trained:
         _refuse_other_places(address)
         return _find(find_row(address), runs)
     if not run.finished:
-        raise RunError(f"{address} holds an unfinished run")
+        raise RunError(f"{address} holds an unfinished run: footwork train ROW --resume goes on with it")
     return load_run(run)
 
 

@@ -278,8 +278,10 @@ def _run_local(board: Board, workers: int, log: Callable[[str], None]) -> None:
             while len(board.done) + len(board.failed) < len(board.jobs):
                 lacking = _start_ready(board, cores, at_work, memory)
                 if lacking and not said:
+                    need, free = megabytes_of(board.study, lacking) / 1e3, (memory or 0) / 1e3
                     log(
-                        f"{lacking.name}, and perhaps others, waits: beside what runs there is not enough memory for it"
+                        f"{lacking.name}, and perhaps others, waits: it takes {need:.1f} GB, and of the {free:.1f} GB "
+                        f"that were free at the start there is not enough memory left beside what runs"
                     )
                     said = True
                 time.sleep(POLL)
@@ -479,7 +481,9 @@ def _run_on_ray(board: Board, workers: int, address: str, log: Callable[[str], N
 
 
 def _memory_to_ask_for(study: Study, job: Job, nodes: Iterable[Mapping[str, Any]]) -> int | None:
-    """Bytes, at most what the smallest node with cores has: whichever nodes are lost, there is one that can run it.
+    """Bytes, at most what the largest node with cores has: where no node has room for a run, the largest tries.
+
+    Small nodes beside it are not asked to hold what they cannot, and a run waits for a lost node that alone could.
 
     Args:
         study: the run's.
@@ -487,8 +491,8 @@ def _memory_to_ask_for(study: Study, job: Job, nodes: Iterable[Mapping[str, Any]
         nodes: of the cluster, as ``ray.nodes()`` tells them.
     """
     there = [node["Resources"] for node in nodes if node["Alive"] and node["Resources"].get("CPU")]
-    smallest = min((resources.get("memory", 0) for resources in there), default=0)
-    return int(min(megabytes_of(study, job) * 10**6, smallest)) or None
+    largest = max((resources.get("memory", 0) for resources in there), default=0)
+    return int(min(megabytes_of(study, job) * 10**6, largest)) or None
 
 
 def _collect_tasks(ray: Any, board: Board, at_work: dict[Any, Job], log: Callable[[str], None]) -> None:

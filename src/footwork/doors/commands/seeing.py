@@ -54,6 +54,8 @@ class Replay(_Film):
 
     def run(self) -> int:
         """Film, and write the page."""
+        if self.to.suffix not in ("", ".html", ".htm"):
+            raise ValueError(f"a replay is a page, and {self.to} does not end in .html (footwork video makes videos)")
         page = self.film()
         path = page.save(self.to)
         steps = sum(episode.num_steps for episode in page.footage)

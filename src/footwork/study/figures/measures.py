@@ -45,8 +45,6 @@ def handover_maps(results: Results, rows: tuple[str, ...]) -> Any:
     figure, axes = panels(-(-len(rows) // 4), 4, 2.2, layout="compressed")
     image = None
     measured = {row: results.measurements(row, TRANSITIONS) for row in rows}
-    least = min((_cells(entries, "success").min() for entries in measured.values() if entries), default=0.0)
-    lowest = min(np.floor(10 * least) / 10, 0.9)
     for ax, (row, entries) in zip(axes.flat, measured.items(), strict=False):
         ax.grid(False)
         ax.set_title(f"{row.partition('walker/')[2]}\n{seeds_in_words(len(entries))}", fontsize=8)
@@ -55,11 +53,11 @@ def handover_maps(results: Results, rows: tuple[str, ...]) -> Any:
             empty(ax, "no finished runs yet")
             continue
         success, speed = _cells(entries, "success"), _cells(entries, "speed_mps")
-        image = ax.imshow(success, vmin=lowest, vmax=1, cmap="cividis")
+        image = ax.imshow(success, vmin=0, vmax=1, cmap="cividis")  # one scale: engines and ants are compared
         for i in range(4):
             for j in range(4):
-                colour = "white" if success[i, j] < (lowest + 1) / 2 else "black"
-                text = f"{100 * success[i, j]:.0f}\n{speed[i, j]:.1f}"
+                colour = "white" if success[i, j] < 0.5 else "black"
+                text = f"{100 * success[i, j]:.0f}\n{speed[i, j]:z.1f}"
                 ax.text(j, i, text, ha="center", va="center", color=colour, fontsize=7, linespacing=1.0)
         ax.set_xticks(range(4), list(_ARROWS.values()))
         ax.set_yticks(range(4), list(_ARROWS.values()))

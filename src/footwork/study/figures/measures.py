@@ -85,19 +85,22 @@ def switching(results: Results, rows: tuple[str, ...]) -> Any:
     figure, axes = panels(1, 3, 3.2)
     there = {row: entries for row in rows if (entries := results.measurements(row, TRANSITIONS))}
     apart = np.geomspace(0.9, 1.1, len(there)) if len(there) > 1 else [1.0]  # bars beside each other
+    differ = len({len(entries) for entries in there.values()}) > 1
     for ax, (name, words) in zip(axes[0], names.items(), strict=True):
         for (row, entries), shift in zip(there.items(), apart, strict=False):
             periods = sorted({int(k) for entry in entries for k in entry["switching"]})
             values = [[e["switching"][str(k)][name] for e in entries if str(k) in e["switching"]] for k in periods]
             generators = [generator_for(f"switching {row} {name} {k}") for k in periods]
             effects = [contrast([v], (1,), generator) for v, generator in zip(values, generators, strict=True)]
-            interval_marks(ax, np.multiply(periods, shift), effects, look_of(row), label_of(row))
+            label = label_of(row) + (f" ({seeds_in_words(len(entries))})" if differ else "")
+            interval_marks(ax, np.multiply(periods, shift), effects, look_of(row), label)
         ax.set_title(words)
         ax.set_xlabel(f"control steps between switches\n{seeds_of(results, there)}")
         ax.set_xscale("log")
         ax.set_xticks([25, 50, 100, 200], ["25", "50", "100", "200"])
         ax.minorticks_off()
-        ax.set_ylim(bottom=0)
+        top = ax.get_ylim()[1] if name == "speed_mps" else max(ax.get_ylim()[1], 0.1)  # one ant is no tower
+        ax.set_ylim(-0.02 * top, top)
         if not ax.get_legend_handles_labels()[0]:
             empty(ax, "no finished runs yet")
     legend_below(figure, list(axes[0]))

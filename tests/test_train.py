@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,7 @@ import pytest
 
 from footwork import checkpoint
 from footwork import train as training
+from footwork.doors.cli import run, show_warning
 from footwork.record import RunDir, RunError, config_to_json, read_metrics
 from footwork.robot import ROBOTS
 from footwork.study.experiments import EXPERIMENTS, find_row, with_engine, with_robot
@@ -272,6 +275,49 @@ def test_an_unfinished_run_is_no_address(tmp_path):
         find_trained(str(run.path), tmp_path)
 
 
+def test_runs_that_an_address_passes_over_are_warned_of(tmp_path):
+    row = EXPERIMENTS["walker/plain"]
+    folder = tmp_path / row.name
+    finished(tmp_path, replace(row, engine="bullet"), "of-another-row")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # that one is another row's, and its own folder is its address
+        assert find_trained(row.name, tmp_path).source == PACKAGED
+    begun = RunDir.create(folder / "begun", {"experiment": config_to_json(row), "seeds": [0]})
+    with pytest.warns(UserWarning, match=r"begun is not finished: footwork train walker/plain --resume .*packaged"):
+        assert find_trained(row.name, tmp_path).source == PACKAGED
+    mine = finished(tmp_path, row, "mine")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a run under way is no news where another has finished
+        assert find_trained(row.name, tmp_path).source.startswith(mine)
+    (begun.path / "config.json").unlink()
+    for name, text in {"torn": '{"config": {"exp', "foreign": '{"config": {"experiment": {"colour": "red"}}}'}.items():
+        path = Path(finished(tmp_path, row, name))
+        (path / "config.json").write_text(text)
+    (folder / "gone").symlink_to(tmp_path / "nowhere")
+    for without, instead in ((), re.escape(mine)), (("mine/DONE",), "the packaged weights"):
+        for name in without:
+            (folder / name).unlink()
+        with pytest.warns(UserWarning, match="passed over") as warned:
+            find_trained(row.name, tmp_path)
+        for name in ("torn", "foreign", "gone"):
+            (said,) = (str(one.message) for one in warned if f"/{name}" in str(one.message))
+            assert re.search(f"passed over: .*{name}.*; walker/plain is {instead}", said)
+
+
+def test_where_nothing_else_is_at_hand_the_refusal_says_what_was_passed_over(tmp_path):
+    path = Path(finished(tmp_path, find_row("bullet/walker/plain"), "seed-0"))
+    (path / "config.json").write_text("{")
+    with pytest.raises(RunError, match=r"no finished run of bullet/walker/plain .*seed-0/config\.json"):
+        find_trained("bullet/walker/plain", tmp_path)
+
+
+def test_a_missing_extra_leaves_no_run_behind(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(RunError, match=r"footwork\[tb\]"):
+        train_row(tiny("walker/plain"), (0,), tmp_path, tensorboard=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_places_that_are_no_runs_are_told_apart_from_unknown_rows(tmp_path):
     run = tmp_path / "run"
     run.mkdir()
@@ -287,10 +333,22 @@ def test_places_that_are_no_runs_are_told_apart_from_unknown_rows(tmp_path):
 
 
 def test_unknown_and_untrained_rows_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"unknown row 'walker/fast'; known rows: walker/{plain,") as caught:
+    with pytest.raises(
+        ValueError, match=r"unknown row 'walker/fast'; nearest: .*known rows: walker/\.\.\., "
+    ) as caught:
         find_trained("walker/fast", tmp_path)
-    assert all(part in str(caught.value) for row in EXPERIMENTS for part in row.rsplit("/", 1))
-    assert "\n" not in str(caught.value)
+    assert all(f"{row.partition('/')[0]}/" in str(caught.value) for row in EXPERIMENTS)
+    assert len(str(caught.value).splitlines()[0]) < 400
+    for wrong, near in [
+        ("walker/plian", "walker/plain"),
+        ("maze/hrl/apropriate-bias", "maze/hrl/appropriate-bias"),
+        ("bullet/walker/plian", "bullet/walker/plain"),
+        ("ligth/walker/plain", "light/walker/plain"),
+    ]:
+        with pytest.raises(ValueError, match="nearest: ") as caught:
+            find_row(wrong)
+        group, _, last = near.rpartition("/")
+        assert re.search(rf"{group}/({last}|{{[^}}]*\b{last}\b)", str(caught.value)), caught.value
 
 
 @pytest.mark.parametrize(
@@ -314,3 +372,32 @@ def test_bad_seeds_are_refused(tmp_path, seeds, message):
 def test_bad_fields_of_a_row_are_refused(row, change, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(EXPERIMENTS[row], **change)
+
+
+# ---------------------------------------------------------------- at the command line
+
+
+def test_the_command_says_what_a_run_stands_on_and_where_it_goes_on(tmp_path, capsys):
+    small = "--ppo.num-envs 4 --ppo.num-steps 3 --ppo.num-minibatches 2 --ppo.update-epochs 1 --ppo.hidden-sizes 4"
+    options = [*small.split(), "--option-steps", "2", "--task.episode-steps", "4", "--threads", "1"]
+    command = ["train", "bandit/hrl/plain", "--runs", str(tmp_path), "--resume", *options]
+    assert run([*command, "--total-steps", "30"]) == 0
+    said = capsys.readouterr()
+    assert re.search(r"nothing to resume in .*/bandit/hrl/plain/custom-\w+-seed-0: it begins there", said.err)
+    assert "takes 24 control steps, whole iterations of 24" in said.err
+    assert f"trained on those of walker/plain: {PACKAGED}" in said.out
+    assert run([*command, "--total-steps", "48"]) == 0
+    said = capsys.readouterr()
+    assert "goes on from step 24 of 48" in said.err
+    assert "nothing to resume" not in said.err
+    assert "takes" not in said.err
+    place = next(tmp_path.glob("bandit/hrl/plain/custom-*"))
+    assert run(["evaluate", str(place), "--episodes", "1", "--threads", "1"]) == 0
+    assert f"policies from {place / 'policy.safetensors'}" in capsys.readouterr().err
+
+
+def test_a_warning_of_ours_is_one_line_and_others_say_where_they_come_from(capsys):
+    show_warning(UserWarning("passed over: runs/a"), UserWarning, "runs.py", 1)
+    assert capsys.readouterr().err == "footwork: passed over: runs/a\n"
+    show_warning(RuntimeWarning("overflow"), RuntimeWarning, "other.py", 7)
+    assert "other.py:7: RuntimeWarning: overflow" in capsys.readouterr().err

@@ -488,6 +488,11 @@ class Progress:
             self._show()
             self._shown_at = now
 
+    def say(self, what: str) -> None:
+        """Show a line of its own, before the first update."""
+        self._stream.write(f"{self._label}  {what}\n")
+        self._stream.flush()
+
     def close(self) -> None:
         """Show the last line and leave it standing."""
         if self._waiting:
@@ -612,12 +617,21 @@ def _scalars(name: str, value: Any) -> Iterator[tuple[str, float]]:
         yield name, float(value)
 
 
-def _event_writer(directory: Path, next_step: int) -> Any:
+def require_tensorboard() -> Any:
+    """The class that writes event files.
+
+    Raises:
+        RunError: the extra ``footwork[tb]`` is missing.
+    """
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
         raise RunError("TensorBoard event files need an extra: pip install 'footwork[tb]'") from None
-    return SummaryWriter(str(directory), purge_step=next_step)
+    return SummaryWriter
+
+
+def _event_writer(directory: Path, next_step: int) -> Any:
+    return require_tensorboard()(str(directory), purge_step=next_step)
 
 
 def _encode(value: Any, where: str) -> Any:
@@ -713,6 +727,7 @@ __all__ = [
     "config_from_json",
     "config_to_json",
     "read_metrics",
+    "require_tensorboard",
     "source_commit",
     "source_digest",
     "truncate_metrics",

@@ -339,6 +339,8 @@ def _learn(
         Progress(total, experiment.name, initial_step=step) as progress,
         _stop_signals() as stop_asked,
     ):
+        if step > 0:
+            progress.say(f"goes on from step {step:,} of {total:,}")
         while step < total:
             begun = time.monotonic()
             learning, metrics = iterate(experiment, env, learning, seeds[0], compiling)

@@ -11,8 +11,9 @@ import os
 import platform
 import re
 import sys
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import tyro
 
@@ -44,7 +45,22 @@ def main() -> None:
     """The entry point."""
     keep_compiled()
     leave_accelerators(sys.argv[1:])
+    warnings.showwarning = show_warning
     sys.exit(run(sys.argv[1:]))
+
+
+def show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Say in one line what is meant for the user; where in a source it came up, only of what others warn of."""
+    text = f"footwork: {message}\n" if category is UserWarning else None
+    stream = sys.stderr if file is None else file
+    stream.write(text or warnings.formatwarning(message, category, filename, lineno, line))
 
 
 def keep_compiled() -> None:

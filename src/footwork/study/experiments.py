@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -402,14 +403,27 @@ def find_row(name: str) -> Experiment:
     """The row of that name; on another engine than the default where that engine's name comes first.
 
     Raises:
-        ValueError: there is none; lists those there are.
+        ValueError: there is none; names those that are nearest, and where all are listed.
     """
     first, _, rest = name.partition("/")
     if first in ENGINES and rest in EXPERIMENTS:
         return with_engine(EXPERIMENTS[rest], first)
     if name not in EXPERIMENTS:
-        raise ValueError(f"unknown row {name!r}; known rows: {in_braces(EXPERIMENTS)}")
+        raise ValueError(_unknown(name))
     return EXPERIMENTS[name]
+
+
+def _unknown(name: str) -> str:
+    """What is said of an address that is none."""
+    engine, _, rest = name.partition("/")
+    engine, wanted = (f"{engine}/", rest) if engine in ENGINES else ("", name)
+    near = [engine + row for row in get_close_matches(wanted, EXPERIMENTS, n=4, cutoff=0.5)]
+    groups = ", ".join(dict.fromkeys(f"{row.partition('/')[0]}/..." for row in EXPERIMENTS))
+    others = ", ".join(f"{engine}/" for engine in ENGINES if engine != DEFAULT_ENGINE)
+    return (
+        f"unknown row {name!r}; {f'nearest: {in_braces(near)}; ' if near else ''}"
+        f"known rows: {groups} (footwork list --all shows each), and the same after {others}"
+    )
 
 
 def with_engine(row: Experiment, engine: str) -> Experiment:

@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -25,7 +27,15 @@ import jax
 from footwork import checkpoint
 from footwork.checkpoint import CheckpointError
 from footwork.physics import libraries_of, require_engine
-from footwork.record import RunDir, RunError, config_from_json, config_to_json, device_in, versions
+from footwork.record import (
+    RunDir,
+    RunError,
+    config_from_json,
+    config_to_json,
+    device_in,
+    require_tensorboard,
+    versions,
+)
 from footwork.study.experiments import find_row, is_row, with_robot
 from footwork.train import Experiment, Trained, planned_steps, policy_meta, train
 
@@ -64,6 +74,11 @@ def path_of_new_run(runs: Path, experiment: Experiment, seeds: tuple[int, ...]) 
     return path.with_name(f"custom-{hashlib.blake2b(fields, digest_size=4).hexdigest()}-{path.name}")
 
 
+def place_of(runs: Path, experiment: Experiment, seeds: tuple[int, ...], name: str | None) -> Path:
+    """Where a run lies that was given this name, or none."""
+    return path_of_new_run(runs, experiment, seeds) if name is None else runs / experiment.name / name
+
+
 def same_row(one: Experiment, other: Experiment) -> bool:
     """Whether two runs with these fields are runs of the same row: they may differ in length."""
     return _without_length(one) == _without_length(other)
@@ -84,7 +99,7 @@ def train_row(
 ) -> Trained:
     """Train a row into its run directory, and first what it needs where no trained policies are found.
 
-    The directory is ``runs`` / row / ``name``, or the one of :func:`path_of_new_run`.
+    The directory is that of :func:`place_of`.
 
     With ``resume``, goes on from the newest checkpoint, or returns a finished run as it
     is; a larger ``total_steps`` than it was finished with is trained on to (on PyBullet from
@@ -93,12 +108,14 @@ def train_row(
     Raises:
         ValueError: bad seeds, the run was begun with another config, or its engine cannot resume (bullet-original).
         ImportError: its engine is not installed.
-        RunError: the directory is in use, or occupied and not to be resumed.
+        RunError: the directory is in use, or occupied and not to be resumed; or the extra ``footwork[tb]`` is missing.
         CheckpointError: a checkpoint is damaged, or the disk is full.
     """
     _check_seeds(seeds)
     require_engine(experiment.engine, experiment.task.robot)
-    path = path_of_new_run(runs, experiment, seeds) if name is None else runs / experiment.name / name
+    if tensorboard:
+        require_tensorboard()
+    path = place_of(runs, experiment, seeds, name)
     config = {"experiment": config_to_json(experiment), "seeds": list(seeds)}
     if resume and (path / "config.json").is_file():
         run = _reopen(path, config, experiment)
@@ -187,6 +204,16 @@ def _keep_needed(experiment: Experiment, run: RunDir, runs: Path, num_threads: i
     return load_policies(kept)
 
 
+def stands_on(trained: Trained) -> str | None:
+    """Where the policies came from that a run trained on, and keeps beside its own; None if it has none.
+
+    Raises:
+        CheckpointError: their file is damaged.
+    """
+    kept = Path(trained.source).parent / NEEDED
+    return str(checkpoint.load_arrays(kept)[1].get("from", kept)) if kept.is_file() else None
+
+
 def _check_fit(experiment: Experiment, needed: Trained) -> None:
     """Refuse policies that do not walk, or that learned to on another ant."""
     if not needed.experiment.is_walker:
@@ -246,9 +273,49 @@ def _finished(experiment: Experiment, runs: Path) -> list[RunDir]:
 
 def _counts_as(run: RunDir, experiment: Experiment) -> bool:
     try:
-        return same_row(config_from_json(Experiment, run.config().get("experiment")), experiment)
-    except ValueError:  # damaged, or of a version with other fields
+        return same_row(_experiment_of(run), experiment)
+    except ValueError:  # damaged, or of a version with other fields: _unreadable and _unfinished tell of it
         return False
+
+
+def _experiment_of(run: RunDir) -> Experiment:
+    """What a run trained.
+
+    Raises:
+        ValueError: its config.json is missing, damaged or of a version with other fields.
+    """
+    config = run.config().get("experiment")
+    try:
+        return config_from_json(Experiment, config)
+    except ValueError as error:
+        raise ValueError(f"its config.json is not of this version: {error}") from None
+
+
+def _unreadable(experiment: Experiment, runs: Path) -> Iterator[str]:
+    """What lies in the row's folder as a run and cannot be told to be one, each with the reason."""
+    for path in _entries(experiment, runs):
+        if not path.exists():
+            yield f"{path} is a link to nothing"
+        elif any((path / name).exists() for name in ("config.json", "DONE")):
+            try:
+                _experiment_of(RunDir(path))
+            except RunError as error:  # it names the file
+                yield str(error)
+            except ValueError as error:
+                yield f"{path}: {error}"
+
+
+def _unfinished(experiment: Experiment, runs: Path) -> Iterator[str]:
+    """Runs of the row that have not come to their end."""
+    for path in _entries(experiment, runs):
+        run = RunDir(path)
+        if not run.finished and (path / "config.json").is_file() and _counts_as(run, experiment):
+            yield f"{path} is not finished: footwork train {experiment.name} --resume goes on with it"
+
+
+def _entries(experiment: Experiment, runs: Path) -> list[Path]:
+    folder = runs / experiment.name
+    return sorted(folder.iterdir()) if folder.is_dir() else []
 
 
 def packaged(row: str) -> Traversable:
@@ -267,7 +334,11 @@ def find_trained(address: str, runs: Path) -> Trained:
     run = _run_at(address)
     if run is None:
         _refuse_other_places(address)
-        return _find(find_row(address), runs)
+        try:
+            row = find_row(address)
+        except ValueError as error:
+            raise ValueError(f"no run lies at {address!r}; {error}") from None
+        return _find(row, runs)
     if not run.finished:
         raise RunError(f"{address} holds an unfinished run: footwork train ROW --resume goes on with it")
     return load_run(run)
@@ -297,15 +368,26 @@ def _find(experiment: Experiment, runs: Path) -> Trained:
     """The newest finished run with these fields, else packaged weights that have them.
 
     A report's results keep the policies of one run of a row: those without come last, and are then missed aloud.
+    What is passed over is warned of: runs that cannot be read always, unfinished ones where none is finished.
     """
-    for run in sorted(_finished(experiment, runs), key=lambda run: not run.policy_path.is_file()):
-        return load_run(run)
     row = experiment.name
+    unreadable = list(_unreadable(experiment, runs))
+    for run in sorted(_finished(experiment, runs), key=lambda run: not run.policy_path.is_file()):
+        _warn_of_passed_over(unreadable, f"{row} is {run.path}")
+        return load_run(run)
+    passed_over = [*unreadable, *_unfinished(experiment, runs)]
     if packaged(row).is_file():
         trained = _load_packaged(row)
         if same_row(trained.experiment, experiment):
+            _warn_of_passed_over(passed_over, f"{row} is the {PACKAGED}")
             return trained
-    raise RunError(f"no finished run of {row} in {runs} and none in the package: footwork train {row}")
+    reasons = "".join(f"; {reason}" for reason in passed_over)
+    raise RunError(f"no finished run of {row} in {runs} and none in the package: footwork train {row}{reasons}")
+
+
+def _warn_of_passed_over(reasons: list[str], instead: str) -> None:
+    for reason in reasons:
+        warnings.warn(f"passed over: {reason}; {instead}", stacklevel=4)
 
 
 def _load_packaged(row: str) -> Trained:

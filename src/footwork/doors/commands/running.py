@@ -61,15 +61,22 @@ class Train:
     def run(self, rest: list[str]) -> int:
         """Train; ``rest`` are the options that name fields of the row."""
         from footwork.record import config_to_json
-        from footwork.study.runs import train_row
+        from footwork.study.runs import place_of, stands_on, train_row
 
         experiment = self._customised(rest)
         if self.fields:
             print(json.dumps(config_to_json(experiment), indent=2))
             return 0
+        if any(option.startswith(("--total-steps", "--total_steps")) for option in rest):
+            _say_rounding(experiment)
         seeds, physics_threads = tuple(self.seeds), self.threads
+        place = place_of(self.runs, experiment, seeds, self.name)
+        if self.resume and not (place / "config.json").is_file():
+            print(f"{experiment.name}: nothing to resume in {place}: it begins there", file=sys.stderr)
         trained = train_row(experiment, seeds, self.runs, self.name, self.resume, physics_threads, self.tensorboard)
-        print(f"{experiment.name}: finished; policies in {trained.source}")
+        below = stands_on(trained)
+        stands = "" if below is None else f", trained on those of {experiment.needs}: {below}"
+        print(f"{experiment.name}: finished; policies in {trained.source}{stands}")
         return 0
 
     def _customised(self, rest: list[str]) -> Experiment:
@@ -116,6 +123,7 @@ class Evaluate:
         trained = find_trained(self.row, self.runs)
         needed = find_needed(trained, self.runs)
         trained = _played_on(trained, self.engine)
+        _say_source(trained)
         _at_least_one("episodes", self.episodes)
         report = evaluate(trained, needed, self.episodes, self.seed, self.deterministic, self.threads)
         if self.json:
@@ -146,6 +154,7 @@ class Transitions:
         from footwork.study.runs import find_trained
 
         trained = _played_on(find_trained(self.row, self.runs), self.engine)
+        _say_source(trained)
         _at_least_one("ants", self.ants)
         report = transitions(
             trained,
@@ -211,6 +220,20 @@ def _played_on(trained: Trained, engine: str | None) -> Trained:
     experiment = trained.experiment if engine is None else replace(trained.experiment, engine=engine)
     require_engine(experiment.engine, experiment.task.robot)
     return trained._replace(experiment=experiment)
+
+
+def _say_rounding(experiment: Experiment) -> None:
+    """How many control steps a run takes that was asked for a number which is not one of whole iterations."""
+    from footwork.train import planned_steps, steps_per_iteration
+
+    steps, one = planned_steps(experiment), steps_per_iteration(experiment)
+    if steps != experiment.total_steps:
+        print(f"{experiment.name}: takes {steps:,} control steps, whole iterations of {one:,}", file=sys.stderr)
+
+
+def _say_source(trained: Trained) -> None:
+    """Which policies an address turned out to mean."""
+    print(f"{trained.experiment.name}: policies from {trained.source}", file=sys.stderr)
 
 
 def _at_least_one(name: str, value: int) -> None:

@@ -53,6 +53,9 @@ def test_wilson_at_newcombes_published_examples():
         (1, 29, 0.0061, 0.1718),
     ]:
         assert statistics.wilson(hits, count) == pytest.approx((low, high), abs=5e-5)
+    for count in range(1, 300):
+        assert statistics.wilson(0, count)[0] == 0.0
+        assert statistics.wilson(count, count)[1] == 1.0
     with pytest.raises(ValueError, match="got 3 of 2"):
         statistics.wilson(3, 2)
 

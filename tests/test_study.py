@@ -410,6 +410,11 @@ def test_a_damaged_matrix_of_hand_overs_is_named(study):
         found = results.Results(study)
         assert len(found.scores("walker/plain", "handover")) == 0
         assert any("transitions.json is damaged" in problem for problem in found.problems)
+    some = {k: figures for k, figures in entry["switching"].items() if k != "50"}
+    with_entry(path, **{**entry, "switching": some})
+    found = results.Results(study)
+    assert len(found.scores("walker/plain", "moving")) == 0
+    assert any("does not say how random switching every 50 steps went" in problem for problem in found.problems)
 
 
 def test_half_a_curve_is_none(study):
@@ -444,11 +449,13 @@ def test_folders_that_no_row_would_find_are_named(study):
     fake_run(study, "maze/flat/free", 1).joinpath("config.json").unlink()
     fake_run(study, "walker/plain", 0).rename(study.runs / "walker" / "plainn")
     shutil.copytree(study.runs / "maze", study.runs / "mase")
+    (study.runs / "maze/flat/free/seed-3").symlink_to(study.runs / "nowhere")
     found = results.strays(study)
-    assert len(found) == 4
+    assert len(found) == 5
+    assert any("maze/flat/free/seed-3 is a link to nothing" in problem for problem in found)
     for words in ("seed-1 has no config.json", "walker/plainn lies where no row", "mase/flat/free/seed-0 lies where"):
         assert any(words in problem for problem in found), words
-    assert not any("maze/flat/free/seed-0" in problem for problem in found)
+    assert not any("/maze/flat/free/seed-0" in problem for problem in found)
 
 
 @pytest.mark.parametrize("inside", ["results", "results/full", "results/a/b"])
@@ -471,7 +478,7 @@ def test_a_report_replaces_what_a_report_wrote_and_nothing_else(study, tmp_path,
     (to / "results").mkdir(parents=True)
     (to / "results" / "mine.txt").write_text("years of work")
     assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 1
-    assert "results holds something that no report wrote" in capsys.readouterr().err
+    assert "holds results, and no report wrote it" in capsys.readouterr().err
     (to / "results" / "mine.txt").unlink()
     (to / "REPORT.md").write_text("my own")
     assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 1
@@ -625,7 +632,7 @@ def test_mixed_runs_are_named(study):
     assert len(found.scores("maze/flat/free", "way")) == 1
     assert any("different versions of mujoco: 3.3.0, " in problem for problem in found.problems)
     assert any("on different devices: NVIDIA H200, the CPU" in problem for problem in found.problems)
-    assert any("says nothing of seed 1" in problem for problem in found.problems)
+    assert any("evaluation.json is of seeds [0], the run has [1]: delete" in problem for problem in found.problems)
 
 
 def test_truncated_metrics_are_named(study):
@@ -921,6 +928,34 @@ def test_every_figure_can_be_drawn_of_another_ant_or_engine(study, tmp_path, pre
     assert all(path.is_file() and path.parent.name == prefix.strip("/") for one in drawn for path in one.files)
 
 
+def test_figures_name_what_could_mislead(study, tmp_path):
+    """Rows with unequal seeds say so, maps of different rows have one scale, and grids of one point are no grids."""
+    fill(study, ("walker/plain",), 3)
+    fill(study, ("walker/random-start",), 1, quality=0.9)
+    draw_figures(results.Results(study), find_figures(["12", "14"]), tmp_path)
+    switched = (tmp_path / "12-switching.svg").read_text()
+    assert "plain (3 seeds)" in switched
+    assert "random-start (1 seed)" in switched
+    assert "no finished runs yet of other values" in (tmp_path / "14-regulariser-length.svg").read_text()
+    maps = measures.handover_maps(results.Results(study), WALKERS)
+    assert {image.get_clim() for ax in maps.axes for image in ax.get_images()} == {(0.0, 1.0)}
+    fill(study, ("ablation/random-start/t/10",), 1)
+    draw_figures(results.Results(study), find_figures(["14"]), tmp_path)
+    lengths = (tmp_path / "14-regulariser-length.svg").read_text()
+    assert "random-start/t" in lengths
+    assert "random-repeated/t" not in lengths
+
+
+def test_ants_that_are_driven_back_are_not_cut_off(study, tmp_path):
+    fill(study, ("walker/plain",), 2)
+    for path in study.runs.rglob("transitions.json"):
+        content = json.loads(path.read_text())
+        content["by_seed"][0]["switching"]["25"]["speed_mps"] = -0.5
+        write(path, content)
+    speed = measures.switching(results.Results(study), ("walker/plain",)).axes[0]
+    assert speed.get_ylim()[0] < -0.5
+
+
 def test_every_figure_is_drawn_where_there_is_nothing_yet(study, tmp_path):
     study.runs.mkdir()
     numbers = [int(figure.name.partition("-")[0]) for figure in FIGURES]
@@ -1171,6 +1206,40 @@ def test_one_seed_has_no_interval(study):
     assert judgement.why.startswith("1 seed, 10 are asked for")
     (variance,) = (j for j in judging.judge_all(results.Results(study)) if j.claim.number == 6)
     assert judging.show_effect(variance.findings[0]) == "-"
+
+
+def test_few_seeds_show_no_probability_and_versions_only_of_what_took_part(study):
+    fill(study, ("walker/plain", "walker/random-start"), 2)
+    fill(study, ("bullet/walker/plain", "bullet/walker/random-start"), 1)
+    for path in study.runs.rglob("config.json"):
+        config = json.loads(path.read_text())
+        config["versions"] |= {"pybullet": "3.2.7"}
+        write(path, config)
+    found = results.Results(study)
+    judgements = judging.judge_all(found)
+    compared = [f for j in judgements for f in j.findings if len(f.rows) > 1 and min(f.seeds) in (1, 2)]
+    assert compared
+    assert all(judging.show_chance(finding) is None for finding in compared)
+    said = report.write_report(found, study.runs.parent / "out", "footwork report")[0].read_text()
+    assert "| pybullet | 3.2.7 | 2 |" in said  # not the runs on MuJoCo
+    assert re.search(r"\* bullet: undecided, too few seeds: (\d+, )*12(, \d+)*; runs missing: \d+", said)
+    assert re.search(r"1 of 10: [^;]*bullet/walker/{plain,random-start}", said)
+    for row in ("walker/plain", "walker/random-start"):
+        fake_run(study, row, 2)
+    judgements = judging.judge_all(results.Results(study))
+    compared = [f for j in judgements for f in j.findings if len(f.rows) > 1 and min(f.seeds) == 3]
+    assert any(judging.show_chance(finding) for finding in compared)
+
+
+def test_a_plan_says_what_is_done(study, capsys):
+    fill(study, ("walker/plain",), 2)
+    shorter = ["reproduce", "--plan", "--seeds", "3", "--rows", "walker/plain", "walker/random-start"]
+    assert run([*shorter, "--runs", str(study.runs)]) == 0
+    said = capsys.readouterr().out
+    assert "6 runs, " in said
+    assert "2 runs done, " in said
+    assert re.search(r"walker/plain +│ +3 │ +2 │", said)
+    assert re.search(r"walker/random-start +│ +3 │ +0 │", said)
 
 
 def test_a_study_on_an_engine_that_is_missing_is_refused_before_anything_is_begun(tmp_path, monkeypatch, capsys):

@@ -237,12 +237,20 @@ def test_runs_of_large_ants_need_more_memory():
 def test_a_container_has_no_more_memory_than_its_limit(tmp_path, limit, free):
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemTotal: 9765625 kB\nMemAvailable: 7812500 kB\n")
-    for name, text in {"memory.max": limit, "memory.current": "1500000000\n"}.items():
-        if text is not None:
-            (tmp_path / name).write_text(text)
-    (tmp_path / "memory.stat").write_text("anon 500000000\ninactive_file 1000000000\n")
-    assert free_megabytes(meminfo, tmp_path) == free
-    assert free_megabytes(tmp_path / "none", tmp_path) is None
+    job = tmp_path / "slice" / "job"
+    job.mkdir(parents=True)
+    own = tmp_path / "own"
+    for name, group in {"/": tmp_path, "/slice": job.parent, "/slice/job": job}.items():
+        for file, text in {"memory.max": limit, "memory.current": "1500000000\n"}.items():
+            if text is not None:
+                (group / file).write_text(text)
+        (group / "memory.stat").write_text("anon 500000000\ninactive_file 1000000000\n")
+        for inside in {name, "/slice/job"}:  # its limit, or one of those around it
+            own.write_text(f"4:memory:/other\n0::{inside}\n")
+            assert free_megabytes(meminfo, tmp_path, own) == free
+        (group / "memory.max").unlink(missing_ok=True)
+    assert free_megabytes(meminfo, tmp_path, tmp_path / "none") == 8_000
+    assert free_megabytes(tmp_path / "none", tmp_path, own) is None
 
 
 def test_a_cluster_is_asked_for_no_more_memory_than_a_node_has():

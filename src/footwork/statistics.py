@@ -221,7 +221,8 @@ def wilson(hits: float, count: float) -> tuple[float, float]:
     z, rate = 1.959964, hits / count
     middle = (rate + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
+    low = 0.0 if hits == 0 else max(middle - half, 0.0)  # by arithmetic alone it would miss both ends by a last digit
+    return low, 1.0 if hits == count else min(middle + half, 1.0)
 
 
 def rate_over_seeds(hits: npt.ArrayLike) -> tuple[float, float]:

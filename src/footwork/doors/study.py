@@ -11,6 +11,7 @@ from footwork.physics import require_engine
 from footwork.record import RunError
 from footwork.study.experiments import is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
+from footwork.study.job import completed
 from footwork.study.judging import judge_all
 from footwork.study.plan import FULL, QUICK, Study, mark, plan, read_mark
 from footwork.study.report import write_report
@@ -29,7 +30,10 @@ def reproduce(command: Reproduce) -> int:
     study = Study(command.runs or Path(f"runs{ending}"), size)
     jobs = plan(study, match_rows(command.rows) if command.rows else (), command.seeds)
     if command.plan:
-        tables.show(tables.plan_table(jobs, size.name))
+        done, problems = completed(study, jobs)
+        for problem in problems:
+            _say(problem)
+        tables.show(tables.plan_table(jobs, done, size.name))
         return 0
     for row in {study.row(job.row) for job in jobs}:
         require_engine(row.engine, row.task.robot)

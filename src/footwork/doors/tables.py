@@ -76,15 +76,17 @@ def _row_cells(row: Experiment, name: str, found: str) -> tuple[str, ...]:
     return name, kind, row.task.name, row.needs or "", str(row.ppo.batch_size), k, steps, found
 
 
-def plan_table(jobs: list[Job], size: str) -> Table:
-    """What a study would run: seeds and control steps of each row."""
-    total = sum(job.steps for job in jobs)
-    table = Table(title=f"{size} study: {len(jobs)} runs, {total:,} control steps", title_justify="left")
-    for column in ("row", "seeds", "control steps"):
+def plan_table(jobs: list[Job], done: set[Job], size: str) -> Table:
+    """What a study would run, and how much of it is there: seeds and control steps of each row."""
+    total, left = (sum(job.steps for job in some) for some in (jobs, [job for job in jobs if job not in done]))
+    title = f"{size} study: {len(jobs)} runs, {total:,} control steps\n{len(done)} runs done, {left:,} steps to do"
+    table = Table(title=title, title_justify="left")
+    for column in ("row", "seeds", "done", "control steps"):
         table.add_column(column, justify="left" if column == "row" else "right", no_wrap=True)
     for row in dict.fromkeys(job.row for job in jobs):
         mine = [job for job in jobs if job.row == row]
-        table.add_row(row, str(len(mine)), f"{sum(job.steps for job in mine):,}")
+        there = sum(job in done for job in mine)
+        table.add_row(row, str(len(mine)), str(there), f"{sum(job.steps for job in mine):,}")
     return table
 
 

@@ -5,6 +5,7 @@ An engine is a module here and a line in :data:`ENGINES`. Nothing of it is impor
 
 from __future__ import annotations
 
+import math
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -49,13 +50,17 @@ def libraries_of(name: str) -> tuple[str, ...]:
     return ("jax", "mujoco", *([extra] if extra else []))
 
 
-def free_megabytes(meminfo: Path = Path("/proc/meminfo"), cgroup: Path = Path("/sys/fs/cgroup")) -> float | None:
-    """Memory that programs can still have on this machine, or in this container; None where that is not known.
+def free_megabytes(
+    meminfo: Path = Path("/proc/meminfo"),
+    cgroups: Path = Path("/sys/fs/cgroup"),
+    own: Path = Path("/proc/self/cgroup"),
+) -> float | None:
+    """Memory that programs can still have on this machine, in this container or in this batch job; None if not known.
 
     Args:
         meminfo: what Linux says of the machine.
-        cgroup: what it says of the container, if this is one (control groups, version 2). Files that were read
-            and not lately looked at are kept in its memory only as long as nobody else wants it.
+        cgroups: where it keeps what it says of control groups, version 2.
+        own: which of them this process is in. It has what that one and all around it leave it.
     """
     try:
         available = next(line for line in meminfo.read_text("ascii").splitlines() if line.startswith("MemAvailable:"))
@@ -63,11 +68,23 @@ def free_megabytes(meminfo: Path = Path("/proc/meminfo"), cgroup: Path = Path("/
     except (OSError, StopIteration):
         return None
     try:
-        limit, used = (int((cgroup / name).read_text("ascii")) for name in ("memory.max", "memory.current"))
-        held = dict(line.split() for line in (cgroup / "memory.stat").read_text("ascii").splitlines())
-        return min(free, (limit - used + int(held.get("inactive_file", 0))) / 1e6)
-    except (OSError, ValueError):  # no container, or one without a limit ("max")
-        return free
+        name = next(line for line in own.read_text("utf-8").splitlines() if line.startswith("0::/")).removeprefix(
+            "0::/"
+        )
+    except (OSError, StopIteration):
+        name = ""
+    groups = [cgroups / name, *(cgroups / around for around in Path(name).parents)]
+    return min(free, *(_free_in(group) for group in groups))
+
+
+def _free_in(group: Path) -> float:
+    """Megabytes that a control group leaves; infinite where there is none, or none with a limit (``max``)."""
+    try:
+        limit, used = (int((group / name).read_text("ascii")) for name in ("memory.max", "memory.current"))
+        held = dict(line.split() for line in (group / "memory.stat").read_text("ascii").splitlines())
+    except (OSError, ValueError):
+        return math.inf
+    return (limit - used + int(held.get("inactive_file", 0))) / 1e6  # files not lately read give way to who wants it
 
 
 def check_engine(name: str) -> None:

@@ -264,13 +264,13 @@ def show_bound(what: Contrast) -> str:
     return f"{what.rule}, {metric.number(what.bound)} {metric.unit if len(what.rows) == 1 else metric.difference}"
 
 
-def show_chance(finding: Finding) -> str:
+def show_chance(finding: Finding) -> str | None:
     """The probability of improvement; of spreads, that a run is farther from the middle of its row.
 
-    Of one or two seeds it says nothing beside the effect.
+    None with one or two seeds, of which it says nothing beside the effect.
     """
     if finding.probability is None or min(finding.seeds) < 3:
-        return "-"
+        return None
     farther = " farther from the middle" if finding.contrast.statistic == "spread" else ""
     return f"{finding.probability:.2f}{farther}"
 

@@ -21,7 +21,7 @@ from footwork.checkpoint import write_atomically
 from footwork.evaluate import Episodes, play_episodes, transitions
 from footwork.record import RunDir, RunError, versions
 from footwork.study.experiments import find_row, is_row
-from footwork.study.plan import Size
+from footwork.study.plan import SIZES, Size
 from footwork.study.runs import NEEDED, how_to_train_again, load_policies, load_run, one_seed
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment, Trained, choices_of
@@ -63,10 +63,16 @@ def problem_with(run: RunDir, name: str, size: Size | None = None) -> str | None
         return f"{path} is of a policy {content.get('steps')} steps old, the run has {done.get('steps')}"
     if size is not None and content.get("size") != size.name:
         return f"{path} is of the {content.get('size')} study, not of the {size.name} one"
-    return _malformed(path, content["by_seed"], str(done.get("row")))
+    malformed = _malformed(path, content["by_seed"], str(done.get("row")), SIZES.get(str(content.get("size"))))
+    if malformed:
+        return malformed
+    measured_seeds, seeds = [entry["seed"] for entry in content["by_seed"]], done.get("seeds")
+    if measured_seeds != seeds:
+        return f"{path} is of seeds {measured_seeds}, the run has {seeds}"
+    return None
 
 
-def _malformed(path: Path, entries: Any, row: str) -> str | None:
+def _malformed(path: Path, entries: Any, row: str, size: Size | None) -> str | None:
     """What is wrong with the entries of a file of measurements: whatever claims and figures read must be there."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         return f"{path} is damaged: it holds no entries"
@@ -74,7 +80,7 @@ def _malformed(path: Path, entries: Any, row: str) -> str | None:
     try:
         for entry in entries:
             if path.name == TRANSITIONS:
-                _check_transitions(entry)
+                _check_transitions(entry, size.periods if size is not None else ())
             elif experiment is None or experiment.is_walker:
                 _check_walking(entry)
             else:
@@ -110,10 +116,12 @@ def _check_arriving(entry: dict[str, Any], experiment: Experiment) -> None:
             raise ValueError("a choice for every piece of a path")
 
 
-def _check_transitions(entry: dict[str, Any]) -> None:
+def _check_transitions(entry: dict[str, Any], periods: tuple[int, ...]) -> None:
     _check([entry["seed"]], 0, math.inf, whole=True)
     if [len(line) for line in entry["handover"]] != [len(DIRECTIONS)] * len(DIRECTIONS) or not entry["switching"]:
         raise ValueError("from every direction to every direction, and switched at random")
+    for missing in (k for k in periods if str(k) not in entry["switching"]):
+        raise KeyError(f"how random switching every {missing} steps went")
     cells = [cell for line in entry["handover"] for cell in line]
     _check([cell["success"] for cell in cells], 0, 1)
     figures = list(entry["switching"].values())

@@ -186,11 +186,13 @@ def _summary(results: Results, judgements: Sequence[Judgement], rows: Sequence[s
     default = find_row("walker/plain")
     where = f"{default.engine}, {default.task.robot.name} ant"
     text = f"{len(CLAIMS)} claims, judged from {seeds} ({where} if not said otherwise).{length}"
-    elsewhere: dict[str, list[str]] = {}
-    for j in judgements:
-        if j.setting.prefix:
-            elsewhere.setdefault(j.setting.prefix.strip("/"), []).append(f"{j.claim.number} {_standing(j).lower()}")
-    lines += [f"{place}: {', '.join(dict.fromkeys(found))}" for place, found in elsewhere.items()]
+    for prefix in dict.fromkeys(j.setting.prefix for j in judgements if j.setting.prefix):
+        standing_of = {
+            s: [str(j.claim.number) for j in judgements if j.setting.prefix == prefix and _standing(j) == s]
+            for s in _STANDINGS
+        }
+        said = "; ".join(f"{s.lower()}: {', '.join(dict.fromkeys(n))}" for s, n in standing_of.items() if n)
+        lines.append(f"{prefix.strip('/')}: {said}")
     return [Text(text), Bullets(tuple(lines))]
 
 
@@ -252,7 +254,7 @@ def _claims_table(judgements: Sequence[Judgement]) -> TableBlock:
 
 def _said(finding: Finding) -> str:
     """A comparison in one line."""
-    chance = "" if (shown := show_chance(finding)) == "-" else f", P {shown}"
+    chance = "" if (shown := show_chance(finding)) is None else f", P {shown}"
     return f"{finding.contrast.words}: {show_effect(finding)}{chance}, {seeds_in_words(_seeds(finding.seeds))}"
 
 
@@ -276,7 +278,7 @@ def _comparisons_table(judgements: Sequence[Judgement]) -> TableBlock:
             METRICS[f.contrast.metric].words,
             show_bound(f.contrast),
             show_effect(f),
-            show_chance(f),
+            show_chance(f) or "-",
             _seeds(f.seeds),
             f.verdict if f.verdict == f.so_far else f"{f.verdict} (so far: {f.so_far})",
         )
@@ -302,10 +304,12 @@ def _choices_table(results: Results) -> TableBlock:
 def _left_out(results: Results, judgements: Sequence[Judgement], drawn: Sequence[Drawn]) -> list[Block]:
     missing = list(dict.fromkeys(row for d in drawn for row in d.without))
     planned: dict[str, int] = {}
-    read = [row for j in judgements for f in j.findings if f.contrast.decides for row in f.rows]
+    read = {row: j.claim.min_seeds for j in judgements for f in j.findings if f.contrast.decides for row in f.rows}
     for job in plan(results.study):
         planned[job.row] = planned.get(job.row, 0) + 1
-    missing += [row for row in (*planned, *read) if row not in missing and not results.samples(row)]
+    for row, asked in read.items():  # rows of other engines stand in no plan
+        planned.setdefault(row, asked)
+    missing += [row for row in planned if row not in missing and not results.samples(row)]
     few = {row: len(results.samples(row)) for row in planned if 0 < len(results.samples(row)) < planned[row]}
     blocks: list[Block] = []
     if missing:
@@ -315,7 +319,7 @@ def _left_out(results: Results, judgements: Sequence[Judgement], drawn: Sequence
         for row, have in few.items():
             by_count.setdefault(f"{have} of {planned[row]}", []).append(row)
         said = "; ".join(f"{count}: {in_braces(group)}" for count, group in by_count.items())
-        blocks.append(Text(f"Rows with fewer seeds than the study plans: {said}."))
+        blocks.append(Text(f"Rows with fewer seeds than the study plans or a claim asks for: {said}."))
     problems = [
         problem for problem in results.problems if problem not in results.unfinished
     ]  # those are rows with fewer

@@ -45,13 +45,14 @@ def check_place(study: Study, to: Path) -> None:
         return
     if runs.resolve().is_relative_to(place.resolve()):
         raise RunError(f"{place} would be replaced, and the runs in {runs} are in it: choose another --to")
-    foreign = [name for name in PAGES if (to / name).exists()] if not (place / WRITTEN).is_file() else []
-    if foreign:
-        raise RunError(f"{to} holds {foreign[0]}, and no report wrote it (no {place / WRITTEN}): choose another --to")
-    if not place.exists() or (place.is_dir() and not any(place.iterdir())):
-        return
     if not (place / WRITTEN).is_file():
-        raise RunError(f"{place} holds something that no report wrote (it has no {WRITTEN}): choose another --to")
+        empty = not place.exists() or (place.is_dir() and not any(place.iterdir()))
+        foreign = [*([] if empty else [RESULTS]), *(name for name in PAGES if (to / name).exists())]
+        if foreign:
+            raise RunError(
+                f"{to} holds {foreign[0]}, and no report wrote it (no {place / WRITTEN}): choose another --to"
+            )
+        return
     if read_mark(place) != study.size:
         raise RunError(
             f"{place} is of the {read_mark(place).name} study, not of the {study.size.name} one: choose another --to"

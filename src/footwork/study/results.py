@@ -162,10 +162,7 @@ class Results:
                     remedy = how_to_train_again(sample.run, sample.row)
                 self.problems[f"{problem}: {remedy}"] = None
             self._files[key] = [] if problem else json.loads((sample.run.path / name).read_bytes())["by_seed"]
-        found = next((entry for entry in self._files[key] if entry["seed"] == sample.seed), None)
-        if found is None and self._files[key]:
-            self.problems[f"{sample.run.path / name} says nothing of seed {sample.seed}"] = None
-        return found
+        return next((entry for entry in self._files[key] if entry["seed"] == sample.seed), None)
 
 
 def find_samples(study: Study, row: str, any_length: bool = False) -> tuple[tuple[Sample, ...], list[LeftOut]]:
@@ -208,6 +205,7 @@ def strays(study: Study) -> list[str]:
     """Folders that look like runs and that no row would ever find."""
     problems = []
     for place, _, files in sorted(os.walk(study.runs)):
+        problems += [f"{link} is a link to nothing: left out" for link in _dangling(place, files)]
         if not any(name in files for name in RUN_FILES):
             continue
         path = Path(place)
@@ -217,6 +215,11 @@ def strays(study: Study) -> list[str]:
         elif "config.json" not in files:
             problems.append(f"{path} has no config.json: left out")
     return problems
+
+
+def _dangling(place: str, files: list[str]) -> list[Path]:
+    """Links that lead nowhere; :func:`os.walk` takes them for files."""
+    return sorted(path for path in (Path(place, name) for name in files) if path.is_symlink() and not path.exists())
 
 
 def _mixed_versions(row: str, samples: tuple[Sample, ...]) -> list[str]:

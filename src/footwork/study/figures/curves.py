@@ -118,12 +118,14 @@ def task_curves(results: Results, rows: tuple[str, ...]) -> Any:
     """Masters (and flat policies) of one task, with the paper's reward and schedule and with ours."""
     kinds = {"paper": [r for r in rows if not _guided(r)], "hrl": [r for r in rows if _guided(r)]}
     log = any(find_row(row).total_steps > 4 * find_row(rows[0]).total_steps for row in rows)
-    figure, axes = panels(1, 2, 3.6, share_y=True)
+    same = len({_progress(mine) for mine in kinds.values() if mine}) < 2  # measure, and so the scale
+    figure, axes = panels(1, 2, 3.6, share_y=same)
     for ax, (schedule, mine) in zip(axes[0], kinds.items(), strict=True):
         drawn = [draw_row(ax, results, row, share_of_way, label_of(row), log=log) for row in mine]
         ax.set_title(f"{SCHEDULES[schedule]};\n{_progress(mine)}")
         _steps(ax, log, seeds_of(results, mine))
-        ax.axhline(1.0, color="#999999", lw=0.8, ls=":")
+        if ax.get_ylim()[1] > 0.5:  # a panel of its own scale need not reach so far
+            ax.axhline(1.0, color="#999999", lw=0.8, ls=":")
         if not any(drawn):
             empty(ax, "no finished runs yet" if mine else "no such rows")
     axes[0, 0].set_ylabel("distance part of the reward\n(share of the whole way; 1: at the goal)")

@@ -87,6 +87,7 @@ def switching(results: Results, rows: tuple[str, ...]) -> Any:
     apart = np.geomspace(0.9, 1.1, len(there)) if len(there) > 1 else [1.0]  # bars beside each other
     differ = len({len(entries) for entries in there.values()}) > 1
     for ax, (name, words) in zip(axes[0], names.items(), strict=True):
+        lowest = 0.0
         for (row, entries), shift in zip(there.items(), apart, strict=False):
             periods = sorted({int(k) for entry in entries for k in entry["switching"]})
             values = [[e["switching"][str(k)][name] for e in entries if str(k) in e["switching"]] for k in periods]
@@ -94,13 +95,14 @@ def switching(results: Results, rows: tuple[str, ...]) -> Any:
             effects = [contrast([v], (1,), generator) for v, generator in zip(values, generators, strict=True)]
             label = label_of(row) + (f" ({seeds_in_words(len(entries))})" if differ else "")
             interval_marks(ax, np.multiply(periods, shift), effects, look_of(row), label)
+            lowest = min(lowest, *(effect.low for effect in effects))  # an ant may be driven back
         ax.set_title(words)
         ax.set_xlabel(f"control steps between switches\n{seeds_of(results, there)}")
         ax.set_xscale("log")
         ax.set_xticks([25, 50, 100, 200], ["25", "50", "100", "200"])
         ax.minorticks_off()
         top = ax.get_ylim()[1] if name == "speed_mps" else max(ax.get_ylim()[1], 0.1)  # one ant is no tower
-        ax.set_ylim(-0.02 * top, top)
+        ax.set_ylim(lowest - 0.02 * top, top)
         if not ax.get_legend_handles_labels()[0]:
             empty(ax, "no finished runs yet")
     legend_below(figure, list(axes[0]))
@@ -115,22 +117,25 @@ def _points(results: Results, grid: Grid, metric: str) -> tuple[list[Any], list[
 
 
 def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, ...], height: float) -> Any:
-    """A column per grid, a line of panels per metric."""
+    """A column per grid that has runs of several values, a line of panels per metric."""
+    grids = tuple(grid for grid in grids if len(_points(results, grid, metrics[0])[0]) > 1)
+    if not grids:
+        figure, axes = panels(1, 1, height)
+        axes[0, 0].axis("off")
+        empty(axes[0, 0], "no finished runs yet of other values than the rows' own")
+        return figure
     figure, axes = panels(len(metrics), len(grids), height)
     for line, metric in zip(axes, metrics, strict=True):
         limits = _limits(METRICS[metric].is_share, [e for grid in grids for e in _points(results, grid, metric)[1]])
         for ax, grid in zip(line, grids, strict=True):
             values, effects = _points(results, grid, metric)
             x = values if all(isinstance(v, int | float) for v in values) else list(range(len(values)))
-            if values:
-                interval_marks(ax, x, effects, Look("#0072B2", "o"), grid.name)
-            if x is values and values:
+            interval_marks(ax, x, effects, Look("#0072B2", "o"), grid.name)
+            if x is values:
                 ax.set_xscale("log")
             counts = [len(results.samples(grid.points()[value])) for value in values]
             ax.set_xticks(x, [f"{v}\n{n}" for v, n in zip(values, counts, strict=True)])
             ax.minorticks_off()
-            if not values:
-                empty(ax, "no finished\nruns yet")
             ax.set_ylim(limits)
             ax.set_title(grid.name.removeprefix("ablation/"))
             ax.set_xlabel(f"{grid.words};\nbelow: seeds")
@@ -268,8 +273,10 @@ def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) 
             )
     ax.set_yticks(range(len(rows)), names if named else [""] * len(rows), fontsize=6.5)
     ax.set_ylim(len(rows) - 0.5, -0.5)
-    if METRICS[metric].is_share:
-        ax.set_xlim(right=1.03)
+    low, high = ax.get_xlim()
+    ax.set_xlim(
+        min(low, -0.03) if METRICS[metric].is_share else min(low, 0.0), 1.03 if METRICS[metric].is_share else high
+    )
     ax.set_xlabel(_wrapped(METRICS[metric].words, 28), fontsize=7)
 
 

@@ -65,12 +65,14 @@ def _walkers(kinds: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"walker/{kind}" for kind in kinds)
 
 
-_BANDS = "Interquartile mean over seeds, pointwise 95 % bootstrap bands."
+_BANDS = "Interquartile mean over seeds, pointwise 95 % bootstrap bands (of three seeds or fewer: their range)."
+_INTERVALS = "IQM over seeds with 95 % intervals (of three seeds or fewer: their range)"
 _REWARD = (
     "Only the distance part of the reward, as the paper plots, in shares of the whole way and averaged over the last "
     "twentieth of the training each time. Left along the straight line; right, on AntMaze, along the shortest way "
-    "around the walls, so that the two panels differ in what is measured. An episode that ends in the goal circle does "
-    f"not quite reach 1. Sub-policies' own training ({{own_steps}} control steps) is not on the axis. {_BANDS}"
+    "around the walls, so that there the panels differ in measure and in scale. An episode that ends in the goal "
+    f"circle does not quite reach 1. Sub-policies' own training ({{own_steps}} control steps) is not on the axis. "
+    f"{_BANDS}"
 )
 
 FIGURES: tuple[Figure, ...] = (
@@ -161,14 +163,14 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "12-switching",
         "Random switching for 2000 control steps",
-        "A new direction drawn from all four every so often; an option under 0.2 m/s is idle. IQM, 95 % intervals.",
+        f"A new direction drawn from all four every so often; an option under 0.2 m/s is idle. {_INTERVALS}.",
         measures.switching,
         _walkers(KINDS),
     ),
     Figure(
         "13-option-length",
         "The length k of an option",
-        "IQM over seeds with 95 % intervals, masters on interleaved sub-policies. Control steps and decisions per "
+        f"{_INTERVALS}, masters on interleaved sub-policies. Control steps and decisions per "
         "update are the same everywhere, so that a longer option leaves a master fewer updates (on AntMaze "
         "{updates_10} at k = 10, {updates_400} at k = 400). maze/k-paper: with the paper's reward and schedule, else "
         "with ours.",
@@ -179,7 +181,7 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "14-regulariser-length",
         "The length t of each regulariser",
-        "IQM over seeds with 95 % intervals. Hand-overs between orthogonal directions, one at a time; options that get "
+        f"{_INTERVALS}. Hand-overs between orthogonal directions, one at a time; options that get "
         "on when the direction is drawn anew every 50 control steps; speed without hand-overs.",
         measures.t_grids,
         measures.rows_of_grids("t"),
@@ -189,7 +191,8 @@ FIGURES: tuple[Figure, ...] = (
         "15-success",
         "Success in training, against steps and against wall time",
         "Share of the episodes that end in the goal, over the last twentieth of the training each time; sub-policies' "
-        "own training ({own_steps} control steps) not counted. Seeds that trained side by side have an equal share of "
+        "own training ({own_steps} control steps) not counted. Masters with our reward and schedule, flat ones with "
+        "the paper's reward (free) and with ours (guided). Seeds that trained side by side have an equal share of "
         f"their time each. {_BANDS}",
         curves.success_curves,
         (
@@ -224,8 +227,8 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "18-profiles",
         "Performance profiles",
-        "Share of runs (seeds) that get farther than each share of the straight-line way, with pointwise 95 % "
-        "bootstrap bands.",
+        "Share of runs (seeds) that get farther than each share of the straight-line way, all trained with our "
+        "reward; pointwise 95 % bootstrap bands (of three seeds or fewer: their range).",
         measures.profiles,
         (
             *_on_kinds("bandit", _KINDS, ("hrl",)),
@@ -237,7 +240,7 @@ FIGURES: tuple[Figure, ...] = (
     Figure(
         "19-choices",
         "What the paper leaves open: B, k, the potential, bonus and annealing, the ant; and parts of interleaving",
-        "IQM over seeds with 95 % intervals; in brackets the number of seeds. There are walls to go around on AntMaze "
+        f"{_INTERVALS}; in brackets the number of seeds. There are walls to go around on AntMaze "
         "only. k-paper-200, B-as-size-paper: the paper's reward and schedule with options of 200 control steps, with "
         "minibatches of 32. The entropy bonus is 0.02 where a name does not say otherwise (annealed and interleaved "
         "ones begin with it), but for the light ant's sub-policies, which have none. Flat policies: their "

@@ -327,11 +327,8 @@ def _of_robot(row: Experiment, robot: Robot) -> Experiment:
 
 def is_row(name: str) -> bool:
     """Whether there is a row of that name."""
-    try:
-        find_row(name)
-    except ValueError:
-        return False
-    return True
+    first, _, rest = name.partition("/")
+    return name in EXPERIMENTS or (first in ENGINES and rest in EXPERIMENTS)
 
 
 def with_robot(experiment: Experiment, robot: Robot) -> Experiment:

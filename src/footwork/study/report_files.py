@@ -97,12 +97,13 @@ def export(results: Results, to: Path) -> None:
     for samples in results.all_samples().values():  # what they stand on is copied and looked at too
         for needs in {sample.experiment.needs for sample in samples} - {None}:
             results.samples(str(needs))
+    stood_on = {results.study.row(row).needs for row in all_rows(results)}
     for row, samples in results.all_samples().items():
         _say_what_stands_elsewhere(results, samples)
         for sample in {sample.run: sample for sample in samples}.values():
             name = f"{row}/{sample.run.path.name}"
             had = (to / name / sample.run.policy_path.name).is_file()
-            _copy_run(results, sample, new / name, row, had or sample.run == samples[0].run)
+            _copy_run(results, sample, new / name, row in stood_on or had or sample.run == samples[0].run)
     if (results.study.runs / STUDY_FILE).is_file():
         shutil.copyfile(results.study.runs / STUDY_FILE, new / STUDY_FILE)
     (new / WRITTEN).write_text("footwork report wrote this folder, and the next one replaces it.\n", encoding="utf-8")
@@ -144,8 +145,8 @@ def _say_what_stands_elsewhere(results: Results, samples: Sequence[Sample]) -> N
             results.problems[said] = None
 
 
-def _copy_run(results: Results, sample: Sample, place: Path, row: str, with_policy: bool) -> None:
-    """Copy what of a run is whole; its policy where other rows stand on it, too."""
+def _copy_run(results: Results, sample: Sample, place: Path, with_policy: bool) -> None:
+    """Copy what of a run is whole."""
     run = sample.run
     place.mkdir(parents=True, exist_ok=True)
     for name in ("config.json", "DONE"):
@@ -156,8 +157,7 @@ def _copy_run(results: Results, sample: Sample, place: Path, row: str, with_poli
     curve = results.whole_curve(sample)
     if curve is not None:
         copy_curve(curve, run, sample.experiment, place / CURVE)
-    stood_on = {results.study.row(other).needs for other in all_rows(results)}
-    if with_policy or row in stood_on:
+    if with_policy:
         try:
             actors, meta = read_actors(run.policy_path)
         except CheckpointError as error:

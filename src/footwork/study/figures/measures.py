@@ -284,6 +284,7 @@ def masters_by_handovers(results: Results, rows: tuple[str, ...]) -> Any:
     """A point per seed: how well its sub-policies hand over, and how often the master on them arrives."""
     prefix = next(row for row in rows if "walker/" in row).partition("walker/")[0]
     there = [one for one in ASSOCIATIONS if any(row.startswith(f"{prefix}{one.place}/") for row in rows)]
+    there = [one for one in there if seed_pairs(results, one, prefix)] or there
     figure, axes = panels(1, len(there), 3.0, share_y=True)
     for ax, association in zip(axes[0], there, strict=True):
         found = seed_pairs(results, association, prefix)
@@ -319,7 +320,8 @@ def profiles(results: Results, rows: tuple[str, ...]) -> Any:
         if not ax.get_legend_handles_labels()[0]:
             empty(ax, "no finished runs yet")
         ax.set_title(f"Ant{place.capitalize()}")
-        ax.set_xlabel(f"share of the way, τ; {seeds_of(results, mine)}")
+        seeds = seeds_of(results, mine)
+        ax.set_xlabel("share of the way, τ" + (f"; {seeds}" if seeds else ""))
         ax.set_ylim(-0.02, 1.02)
     axes[0, 0].set_ylabel("share of runs with way > τ")
     legend_below(figure, list(axes[0]))

@@ -49,9 +49,10 @@ from footwork.study.experiments import (
     is_row,
     match_rows,
 )
-from footwork.study.figures import FIGURES, draw_figures, find_figures, measures, style
+from footwork.study.figures import FIGURES, curves, draw_figures, find_figures, measures, style
 from footwork.study.metrics import METRICS
 from footwork.study.plan import FULL, QUICK, Study
+from footwork.study.runs import run_path
 from footwork.train import planned_steps, steps_per_iteration
 
 WALKERS = ("walker/plain", "walker/random-start", "walker/random-repeated", "walker/appropriate-bias")
@@ -944,6 +945,14 @@ def test_figures_name_what_could_mislead(study, tmp_path):
     lengths = (tmp_path / "14-regulariser-length.svg").read_text()
     assert "random-start/t" in lengths
     assert "random-repeated/t" not in lengths
+    weak = {"quality": 0.2}  # far from the goal
+    fill(study, ("maze/paper/plain", "maze/hrl/plain", "bandit/paper/plain", "bandit/hrl/plain"), 2, **weak)
+    for place, same in {"maze": False, "bandit": True}.items():
+        rows = tuple(f"{place}/{schedule}/plain" for schedule in ("paper", "hrl"))
+        left, right = curves.task_curves(results.Results(study), rows).axes[:2]
+        assert left.get_shared_y_axes().joined(left, right) == same
+        lines = [1.0 in line.get_ydata() and len(line.get_ydata()) == 2 for line in left.lines]
+        assert any(lines) or any("off this scale" in text.get_text() for text in left.texts)
 
 
 def test_ants_that_are_driven_back_are_not_cut_off(study, tmp_path):
@@ -1240,6 +1249,19 @@ def test_a_plan_says_what_is_done(study, capsys):
     assert "2 runs done, " in said
     assert re.search(r"walker/plain +│ +3 │ +2 │", said)
     assert re.search(r"walker/random-start +│ +3 │ +0 │", said)
+    one = planned_steps(find_row("walker/plain")) * 4
+    assert f" {4 * one:,} steps to do" in said
+    (run_path(study.runs, "walker/plain", (1,)) / "transitions.json").unlink()  # measuring is left of it
+    torn = run_path(study.runs, "walker/plain", (0,)) / "config.json"
+    torn.write_text("{")
+    assert run([*shorter, "--runs", str(study.runs)]) == 0
+    said = capsys.readouterr().out
+    assert "config.json is damaged" in said.replace("\n", " ")
+    left = int(re.search(r"([\d,]+) steps to do", said)[1].replace(",", ""))
+    assert 4.1 * one < left < 5.5 * one
+    plan.mark(Study(study.runs))
+    assert run([*shorter, "--quick", "--runs", str(study.runs)]) == 1
+    assert "holds the full study, not the quick one" in capsys.readouterr().err
 
 
 def test_a_study_on_an_engine_that_is_missing_is_refused_before_anything_is_begun(tmp_path, monkeypatch, capsys):

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from footwork import train as training
 from footwork.doors.cli import run, show_warning
 from footwork.record import RunDir, RunError, config_to_json, read_metrics
 from footwork.robot import ROBOTS
+from footwork.study import runs as runs_module
 from footwork.study.experiments import EXPERIMENTS, find_row, with_engine, with_robot
 from footwork.study.runs import (
     PACKAGED,
@@ -283,7 +285,7 @@ def test_runs_that_an_address_passes_over_are_warned_of(tmp_path):
         warnings.simplefilter("error")  # that one is another row's, and its own folder is its address
         assert find_trained(row.name, tmp_path).source == PACKAGED
     begun = RunDir.create(folder / "begun", {"experiment": config_to_json(row), "seeds": [0]})
-    with pytest.warns(UserWarning, match=r"begun is not finished: footwork train walker/plain --resume .*packaged"):
+    with pytest.warns(UserWarning, match=r"passed over: not finished in .*walker/plain: begun; .*packaged"):
         assert find_trained(row.name, tmp_path).source == PACKAGED
     mine = finished(tmp_path, row, "mine")
     with warnings.catch_warnings():
@@ -294,14 +296,18 @@ def test_runs_that_an_address_passes_over_are_warned_of(tmp_path):
         path = Path(finished(tmp_path, row, name))
         (path / "config.json").write_text(text)
     (folder / "gone").symlink_to(tmp_path / "nowhere")
-    for without, instead in ((), re.escape(mine)), (("mine/DONE",), "the packaged weights"):
+    (Path(finished(tmp_path, row, "half")) / "DONE").write_text('{"steps"')
+    finished(tmp_path, replace(row, ppo=replace(row.ppo, gamma=0.9)), "seed-7")  # the row's own place
+    (folder / "headless").mkdir()
+    (folder / "headless" / "policy.safetensors").write_text("")
+    for without, instead in ((), re.escape(mine)), (("mine/DONE",), PACKAGED):
         for name in without:
             (folder / name).unlink()
         with pytest.warns(UserWarning, match="passed over") as warned:
             find_trained(row.name, tmp_path)
-        for name in ("torn", "foreign", "gone"):
+        for name in ("torn", "foreign", "gone", "half", "seed-7", "headless"):
             (said,) = (str(one.message) for one in warned if f"/{name}" in str(one.message))
-            assert re.search(f"passed over: .*{name}.*; walker/plain is {instead}", said)
+            assert re.search(f"passed over: .*{name}.*; walker/plain means {instead}", said)
 
 
 def test_where_nothing_else_is_at_hand_the_refusal_says_what_was_passed_over(tmp_path):
@@ -309,6 +315,28 @@ def test_where_nothing_else_is_at_hand_the_refusal_says_what_was_passed_over(tmp
     (path / "config.json").write_text("{")
     with pytest.raises(RunError, match=r"no finished run of bullet/walker/plain .*seed-0/config\.json"):
         find_trained("bullet/walker/plain", tmp_path)
+    shutil.rmtree(path.parent)
+    path.parent.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(RunError, match=r"bullet/walker/plain is a link to nothing"):
+        find_trained("bullet/walker/plain", tmp_path)
+
+
+def test_what_a_run_stands_on_is_trained_anew_with_the_reason_said(tmp_path, monkeypatch):
+    row = tiny("light/maze/hrl/plain")
+    below = EXPERIMENTS["light/walker/plain"]
+    path = Path(finished(tmp_path, below, "seed-1"))
+    (path / "config.json").write_text("{")
+    whole = runs_module.train_row
+
+    def small(experiment, *arguments, **options):
+        if experiment.is_walker:
+            finished(tmp_path, experiment, "instead")
+            return find_trained(str(tmp_path / below.name / "instead"), tmp_path)
+        return whole(experiment, *arguments, **options)
+
+    monkeypatch.setattr(runs_module, "train_row", small)
+    with pytest.warns(UserWarning, match=r"passed over: .*seed-1/config\.json.*; light/walker/plain is trained first"):
+        small(row, (0,), tmp_path, num_threads=1)
 
 
 def test_a_missing_extra_leaves_no_run_behind(tmp_path, monkeypatch):
@@ -348,7 +376,7 @@ def test_unknown_and_untrained_rows_are_named(tmp_path):
         with pytest.raises(ValueError, match="nearest: ") as caught:
             find_row(wrong)
         group, _, last = near.rpartition("/")
-        assert re.search(rf"{group}/({last}|{{[^}}]*\b{last}\b)", str(caught.value)), caught.value
+        assert re.search(rf" {group}/({last}|{{[^}}]*\b{last}\b)", str(caught.value)), caught.value
 
 
 @pytest.mark.parametrize(
@@ -376,11 +404,14 @@ def test_bad_fields_of_a_row_are_refused(row, change, message):
 
 # ---------------------------------------------------------------- at the command line
 
+SMALL = (
+    "--ppo.num-envs 4 --ppo.num-steps 3 --ppo.num-minibatches 2 --ppo.update-epochs 1 --ppo.hidden-sizes 4 "
+    "--option-steps 2 --task.episode-steps 4 --threads 1"
+).split()
+
 
 def test_the_command_says_what_a_run_stands_on_and_where_it_goes_on(tmp_path, capsys):
-    small = "--ppo.num-envs 4 --ppo.num-steps 3 --ppo.num-minibatches 2 --ppo.update-epochs 1 --ppo.hidden-sizes 4"
-    options = [*small.split(), "--option-steps", "2", "--task.episode-steps", "4", "--threads", "1"]
-    command = ["train", "bandit/hrl/plain", "--runs", str(tmp_path), "--resume", *options]
+    command = ["train", "bandit/hrl/plain", "--runs", str(tmp_path), "--resume", *SMALL]
     assert run([*command, "--total-steps", "30"]) == 0
     said = capsys.readouterr()
     assert re.search(r"nothing to resume in .*/bandit/hrl/plain/custom-\w+-seed-0: it begins there", said.err)
@@ -396,8 +427,14 @@ def test_the_command_says_what_a_run_stands_on_and_where_it_goes_on(tmp_path, ca
     assert f"policies from {place / 'policy.safetensors'}" in capsys.readouterr().err
 
 
-def test_a_warning_of_ours_is_one_line_and_others_say_where_they_come_from(capsys):
-    show_warning(UserWarning("passed over: runs/a"), UserWarning, "runs.py", 1)
-    assert capsys.readouterr().err == "footwork: passed over: runs/a\n"
-    show_warning(RuntimeWarning("overflow"), RuntimeWarning, "other.py", 7)
-    assert "other.py:7: RuntimeWarning: overflow" in capsys.readouterr().err
+def test_a_warning_of_ours_is_one_line_said_once_and_others_say_where_they_come_from(tmp_path, capsys):
+    path = Path(finished(tmp_path, EXPERIMENTS["walker/plain"], "torn"))
+    (path / "config.json").write_text("{")
+    command = [sys.executable, "-m", "footwork", "train", "bandit/hrl/plain", "--runs", str(tmp_path), *SMALL]
+    said = subprocess.run([*command, "--total-steps", "24"], capture_output=True, text=True, check=True)
+    passed_over = [line for line in said.stderr.splitlines() if "passed over" in line]  # it is looked up twice
+    assert len(passed_over) == 1, said.stderr
+    assert passed_over[0].startswith("footwork: passed over: ")
+    for kind in (RuntimeWarning, UserWarning):
+        show_warning(kind("overflow"), kind, "other.py", 7)
+        assert f"other.py:7: {kind.__name__}: overflow" in capsys.readouterr().err

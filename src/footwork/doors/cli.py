@@ -57,8 +57,9 @@ def show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """Say in one line what is meant for the user; where in a source it came up, only of what others warn of."""
-    text = f"footwork: {message}\n" if category is UserWarning else None
+    """Say in one line what Footwork warns of; where in a source it came up, only of what others do."""
+    ours = category is UserWarning and Path(filename).is_relative_to(Path(__file__).parents[1])
+    text = f"footwork: {message}\n" if ours else None
     stream = sys.stderr if file is None else file
     stream.write(text or warnings.formatwarning(message, category, filename, lineno, line))
 

@@ -13,11 +13,11 @@ from footwork.study.experiments import is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
 from footwork.study.job import completed
 from footwork.study.judging import judge_all
-from footwork.study.plan import FULL, QUICK, Study, mark, plan, read_mark
+from footwork.study.plan import FULL, QUICK, Study, check_mark, mark, plan, read_mark
 from footwork.study.report import write_report
 from footwork.study.report_files import check_place
 from footwork.study.results import Results, all_rows, strays
-from footwork.study.sweep import run_study
+from footwork.study.sweep import run_study, steps_of
 
 if TYPE_CHECKING:
     from footwork.doors.commands.studying import Reproduce
@@ -30,10 +30,12 @@ def reproduce(command: Reproduce) -> int:
     study = Study(command.runs or Path(f"runs{ending}"), size)
     jobs = plan(study, match_rows(command.rows) if command.rows else (), command.seeds)
     if command.plan:
+        check_mark(study)
         done, problems = completed(study, jobs)
-        for problem in problems:
+        for problem in [*strays(study), *problems]:
             _say(problem)
-        tables.show(tables.plan_table(jobs, done, size.name))
+        taken = {job: job.steps if job in done else steps_of(study, job) for job in jobs}
+        tables.show(tables.plan_table(taken, done, size.name))
         return 0
     for row in {study.row(job.row) for job in jobs}:
         require_engine(row.engine, row.task.robot)

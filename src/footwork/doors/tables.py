@@ -76,9 +76,16 @@ def _row_cells(row: Experiment, name: str, found: str) -> tuple[str, ...]:
     return name, kind, row.task.name, row.needs or "", str(row.ppo.batch_size), k, steps, found
 
 
-def plan_table(jobs: list[Job], done: set[Job], size: str) -> Table:
-    """What a study would run, and how much of it is there: seeds and control steps of each row."""
-    total, left = (sum(job.steps for job in some) for some in (jobs, [job for job in jobs if job not in done]))
+def plan_table(taken: dict[Job, int], done: set[Job], size: str) -> Table:
+    """What a study would run, and how much of it is there: seeds and control steps of each row.
+
+    Args:
+        taken: its runs, with the control steps that each has taken, less a share while it is to be measured.
+        done: those that are complete.
+        size: the study's.
+    """
+    jobs, total = list(taken), sum(job.steps for job in taken)
+    left = total - sum(taken.values())
     title = f"{size} study: {len(jobs)} runs, {total:,} control steps\n{len(done)} runs done, {left:,} steps to do"
     table = Table(title=title, title_justify="left")
     for column in ("row", "seeds", "done", "control steps"):

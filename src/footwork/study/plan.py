@@ -156,18 +156,28 @@ def mark(study: Study) -> None:
     Raises:
         RunError: it holds a study of another size, its mark is damaged, or runs that no study marked.
     """
+    check_mark(study)
     path = study.runs / STUDY_FILE
     if path.is_file():
+        return
+    study.runs.mkdir(parents=True, exist_ok=True)
+    content = {"format": _FORMAT, "size": study.size.name, "footwork": footwork.__version__, "machine": _machine()}
+    checkpoint.write_atomically(path, json.dumps(content).encode() + b"\n")
+
+
+def check_mark(study: Study) -> None:
+    """Refuse a folder that holds another study than this one.
+
+    Raises:
+        RunError: it holds a study of another size, its mark is damaged, or runs that no study marked.
+    """
+    if (study.runs / STUDY_FILE).is_file():
         found = read_mark(study.runs)
         if found != study.size:
             held, asked = found.name, study.size.name
             raise RunError(f"{study.runs} holds the {held} study, not the {asked} one: choose another --runs")
-        return
-    if study.size.short is not None and any(study.runs.glob("*/**/config.json")):
+    elif study.size.short is not None and any(study.runs.glob("*/**/config.json")):
         raise RunError(f"{study.runs} holds runs of their full length, not of the quick study: choose another --runs")
-    study.runs.mkdir(parents=True, exist_ok=True)
-    content = {"format": _FORMAT, "size": study.size.name, "footwork": footwork.__version__, "machine": _machine()}
-    checkpoint.write_atomically(path, json.dumps(content).encode() + b"\n")
 
 
 def read_mark(runs: Path) -> Size:

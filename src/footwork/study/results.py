@@ -22,11 +22,10 @@ from footwork.study.experiments import EXPERIMENTS, MAIN, is_row
 from footwork.study.measure import EVALUATION, problem_with
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
-from footwork.study.runs import how_to_reproduce, how_to_train_again
+from footwork.study.runs import RUN_FILES, how_to_reproduce, how_to_train_again
 from footwork.study.training_curves import Curve, of_seed, read_curve
 from footwork.train import Experiment, planned_steps
 
-RUN_FILES = ("config.json", "DONE", "metrics.jsonl", "policy.safetensors", EVALUATION)  # any of them: a run lies there
 SAME_LENGTH = 0.01  # of the row's steps, by which a run may differ: whole iterations have been rounded up and down
 
 
@@ -205,8 +204,8 @@ def strays(study: Study) -> list[str]:
     """Folders that look like runs and that no row would ever find."""
     problems = []
     for place, _, files in sorted(os.walk(study.runs)):
-        problems += [f"{link} is a link to nothing: left out" for link in _dangling(place, files)]
-        if not any(name in files for name in RUN_FILES):
+        if not any(name in files for name in (*RUN_FILES, EVALUATION)):
+            problems += [f"{link} is a link to nothing: left out" for link in _dangling(study, Path(place), files)]
             continue
         path = Path(place)
         row = path.parent.relative_to(study.runs).as_posix() if path != study.runs else ""
@@ -217,9 +216,11 @@ def strays(study: Study) -> list[str]:
     return problems
 
 
-def _dangling(place: str, files: list[str]) -> list[Path]:
-    """Links that lead nowhere; :func:`os.walk` takes them for files."""
-    return sorted(path for path in (Path(place, name) for name in files) if path.is_symlink() and not path.exists())
+def _dangling(study: Study, place: Path, files: list[str]) -> list[Path]:
+    """Links that lead nowhere, where a run or a row's folder would be; :func:`os.walk` takes them for files."""
+    links = (path for path in (place / name for name in files) if path.is_symlink() and not path.exists())
+    rows = {path: path.relative_to(study.runs) for path in links}
+    return sorted(path for path, row in rows.items() if is_row(row.as_posix()) or is_row(row.parent.as_posix()))
 
 
 def _mixed_versions(row: str, samples: tuple[Sample, ...]) -> list[str]:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -40,6 +39,7 @@ from footwork.study.experiments import find_row, is_row, with_robot
 from footwork.train import Experiment, Trained, planned_steps, policy_meta, train
 
 NEEDED = "needed.safetensors"
+RUN_FILES = ("config.json", "DONE", "metrics.jsonl", "policy.safetensors")  # any of them: a run lies there
 PACKAGED = "packaged weights"
 MAX_SEED = 2**31 - 1
 
@@ -183,10 +183,10 @@ def _find_or_train_needed(experiment: Experiment, runs: Path, num_threads: int) 
         needed = find_trained(experiment.needs, runs)
     else:
         row = with_robot(find_row(experiment.needs), experiment.task.robot)
-        try:
-            needed = _find(row, runs)
-        except RunError:
-            needed = train_row(row, (0,), runs, resume=True, num_threads=num_threads)
+        found, reasons = _look_up(row, runs)
+        instead = f"{row.name} is trained first" if found is None else f"{row.name} means {found.source}"
+        _warn_of_passed_over(reasons, instead)
+        needed = found or train_row(row, (0,), runs, resume=True, num_threads=num_threads)
     _check_fit(experiment, needed)
     return needed
 
@@ -273,8 +273,9 @@ def _finished(experiment: Experiment, runs: Path) -> list[RunDir]:
 
 def _counts_as(run: RunDir, experiment: Experiment) -> bool:
     try:
+        run.summary()
         return same_row(_experiment_of(run), experiment)
-    except ValueError:  # damaged, or of a version with other fields: _unreadable and _unfinished tell of it
+    except ValueError:  # damaged, or of a version with other fields: passed_over tells of it
         return False
 
 
@@ -282,40 +283,44 @@ def _experiment_of(run: RunDir) -> Experiment:
     """What a run trained.
 
     Raises:
-        ValueError: its config.json is missing, damaged or of a version with other fields.
+        RunError: its config.json is missing, damaged or of a version with other fields.
     """
     config = run.config().get("experiment")
     try:
         return config_from_json(Experiment, config)
     except ValueError as error:
-        raise ValueError(f"its config.json is not of this version: {error}") from None
+        version = run.versions().get("footwork", "unknown")
+        raise RunError(f"{run.path} is of another version of footwork ({version}): {error}") from None
 
 
-def _unreadable(experiment: Experiment, runs: Path) -> Iterator[str]:
-    """What lies in the row's folder as a run and cannot be told to be one, each with the reason."""
-    for path in _entries(experiment, runs):
-        if not path.exists():
-            yield f"{path} is a link to nothing"
-        elif any((path / name).exists() for name in ("config.json", "DONE")):
-            try:
-                _experiment_of(RunDir(path))
-            except RunError as error:  # it names the file
-                yield str(error)
-            except ValueError as error:
-                yield f"{path}: {error}"
+def passed_over(experiment: Experiment, runs: Path) -> tuple[list[str], list[str]]:
+    """What lies in the row's folder and is not what its address means: what cannot be used, why; and unfinished runs.
 
-
-def _unfinished(experiment: Experiment, runs: Path) -> Iterator[str]:
-    """Runs of the row that have not come to their end."""
-    for path in _entries(experiment, runs):
-        run = RunDir(path)
-        if not run.finished and (path / "config.json").is_file() and _counts_as(run, experiment):
-            yield f"{path} is not finished: footwork train {experiment.name} --resume goes on with it"
-
-
-def _entries(experiment: Experiment, runs: Path) -> list[Path]:
+    Runs that were asked to be otherwise (``custom-...``, a name of their own) lie there by right and are not told of.
+    """
     folder = runs / experiment.name
-    return sorted(folder.iterdir()) if folder.is_dir() else []
+    if folder.is_symlink() and not folder.exists():
+        return [f"{folder} is a link to nothing"], []
+    if not folder.is_dir():
+        return [f"{folder} is no folder"] if folder.exists() else [], []
+    unusable, unfinished = [], []
+    for path in sorted(folder.iterdir()):
+        if path.is_symlink() and not path.exists():
+            unusable.append(f"{path} is a link to nothing")
+        elif any((path / name).exists() for name in RUN_FILES):
+            run = RunDir(path)
+            try:
+                ours = same_row(_experiment_of(run), experiment)
+                if ours and run.finished:
+                    run.summary()
+            except ValueError as error:  # it names the file
+                unusable.append(str(error))
+                continue
+            if ours and not run.finished:
+                unfinished.append(path.name)
+            elif not ours and path.name.startswith("seed"):
+                unusable.append(f"{path} was trained with other fields than {experiment.name} has now")
+    return unusable, unfinished
 
 
 def packaged(row: str) -> Traversable:
@@ -330,6 +335,8 @@ def find_trained(address: str, runs: Path) -> Trained:
         ValueError: it is neither a row nor the folder of a run.
         RunError: it is a row, and there is neither a run nor packaged weights; or the run is not finished.
         CheckpointError: what was found is damaged.
+
+    Warns of what of the row lies in ``runs`` and was passed over.
     """
     run = _run_at(address)
     if run is None:
@@ -365,29 +372,44 @@ def _refuse_other_places(address: str) -> None:
 
 
 def _find(experiment: Experiment, runs: Path) -> Trained:
-    """The newest finished run with these fields, else packaged weights that have them.
+    """What the row's address means, said where that is not all that lies there.
+
+    Raises:
+        RunError: nothing; names what lies there.
+        CheckpointError: what it means is damaged.
+    """
+    found, reasons = _look_up(experiment, runs)
+    if found is None:
+        row, what_lies_there = experiment.name, "".join(f"; {reason}" for reason in reasons)
+        raise RunError(
+            f"no finished run of {row} in {runs} and none in the package: footwork train {row}{what_lies_there}"
+        )
+    _warn_of_passed_over(reasons, f"{experiment.name} means {found.source}")
+    return found
+
+
+def _look_up(experiment: Experiment, runs: Path) -> tuple[Trained | None, list[str]]:
+    """The newest finished run with these fields, else packaged weights that have them; and what was passed over.
 
     A report's results keep the policies of one run of a row: those without come last, and are then missed aloud.
-    What is passed over is warned of: runs that cannot be read always, unfinished ones where none is finished.
+    Unfinished runs are told of where none is finished.
     """
-    row = experiment.name
-    unreadable = list(_unreadable(experiment, runs))
+    reasons, unfinished = passed_over(experiment, runs)
     for run in sorted(_finished(experiment, runs), key=lambda run: not run.policy_path.is_file()):
-        _warn_of_passed_over(unreadable, f"{row} is {run.path}")
-        return load_run(run)
-    passed_over = [*unreadable, *_unfinished(experiment, runs)]
-    if packaged(row).is_file():
-        trained = _load_packaged(row)
+        return load_run(run), reasons
+    if unfinished:
+        names = ", ".join(unfinished[:3]) + (f" and {len(unfinished) - 3} more" if len(unfinished) > 3 else "")
+        reasons.append(f"not finished in {runs / experiment.name}: {names}")
+    if packaged(experiment.name).is_file():
+        trained = _load_packaged(experiment.name)
         if same_row(trained.experiment, experiment):
-            _warn_of_passed_over(passed_over, f"{row} is the {PACKAGED}")
-            return trained
-    reasons = "".join(f"; {reason}" for reason in passed_over)
-    raise RunError(f"no finished run of {row} in {runs} and none in the package: footwork train {row}{reasons}")
+            return trained, reasons
+    return None, reasons
 
 
 def _warn_of_passed_over(reasons: list[str], instead: str) -> None:
     for reason in reasons:
-        warnings.warn(f"passed over: {reason}; {instead}", stacklevel=4)
+        warnings.warn(f"passed over: {reason}; {instead}", stacklevel=1)  # this line: each is said once
 
 
 def _load_packaged(row: str) -> Trained:

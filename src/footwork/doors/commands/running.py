@@ -28,12 +28,15 @@ class List:
         from footwork.doors import tables
         from footwork.physics import ENGINES
         from footwork.study.experiments import EXPERIMENTS, find_row
-        from footwork.study.runs import finished_runs, packaged
+        from footwork.study.runs import finished_runs, packaged, passed_over
 
         elsewhere = [f"{engine}/{name}" for engine in ENGINES for name in EXPERIMENTS if (self.runs / engine).is_dir()]
         runs = {name: len(finished_runs(name, self.runs)) for name in (*EXPERIMENTS, *elsewhere)}
         rows = [find_row(name) for name in runs if name in EXPERIMENTS or runs[name]]
         found = {row: f"{n} runs" if n else "packaged" if packaged(row).is_file() else "" for row, n in runs.items()}
+        for name in runs:
+            if others := sum(map(len, passed_over(find_row(name), self.runs))):
+                found[name] = f"{found[name]} ({others} unfinished or unusable)".strip()
         tables.show(tables.rows_table(rows, found, self.all))
         return 0
 

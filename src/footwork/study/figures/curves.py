@@ -124,8 +124,12 @@ def task_curves(results: Results, rows: tuple[str, ...]) -> Any:
         drawn = [draw_row(ax, results, row, share_of_way, label_of(row), log=log) for row in mine]
         ax.set_title(f"{SCHEDULES[schedule]};\n{_progress(mine)}")
         _steps(ax, log, seeds_of(results, mine))
-        if ax.get_ylim()[1] > 0.5:  # a panel of its own scale need not reach so far
+        if any(drawn) and (same or ax.get_ylim()[1] > 0.5):
             ax.axhline(1.0, color="#999999", lw=0.8, ls=":")
+        elif any(drawn):
+            ax.text(
+                0.98, 0.02, "the goal, 1, is far off this scale", ha="right", color="#777777", transform=ax.transAxes
+            )
         if not any(drawn):
             empty(ax, "no finished runs yet" if mine else "no such rows")
     axes[0, 0].set_ylabel("distance part of the reward\n(share of the whole way; 1: at the goal)")

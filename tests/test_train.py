@@ -404,10 +404,10 @@ def test_bad_fields_of_a_row_are_refused(row, change, message):
 
 # ---------------------------------------------------------------- at the command line
 
-SMALL = (
-    "--ppo.num-envs 4 --ppo.num-steps 3 --ppo.num-minibatches 2 --ppo.update-epochs 1 --ppo.hidden-sizes 4 "
-    "--option-steps 2 --task.episode-steps 4 --threads 1"
-).split()
+SMALL = [
+    *("--ppo.num-envs", "4", "--ppo.num-steps", "3", "--ppo.num-minibatches", "2", "--ppo.update-epochs", "1"),
+    *("--ppo.hidden-sizes", "4", "--option-steps", "2", "--task.episode-steps", "4", "--threads", "1"),
+]
 
 
 def test_the_command_says_what_a_run_stands_on_and_where_it_goes_on(tmp_path, capsys):
@@ -432,7 +432,7 @@ def test_a_warning_of_ours_is_one_line_said_once_and_others_say_where_they_come_
     (path / "config.json").write_text("{")
     command = [sys.executable, "-m", "footwork", "train", "bandit/hrl/plain", "--runs", str(tmp_path), *SMALL]
     said = subprocess.run([*command, "--total-steps", "24"], capture_output=True, text=True, check=True)
-    passed_over = [line for line in said.stderr.splitlines() if "passed over" in line]  # it is looked up twice
+    passed_over = [line for line in said.stderr.splitlines() if "passed over" in line]
     assert len(passed_over) == 1, said.stderr
     assert passed_over[0].startswith("footwork: passed over: ")
     for kind in (RuntimeWarning, UserWarning):

@@ -117,15 +117,16 @@ def train_row(
         require_tensorboard()
     path = place_of(runs, experiment, seeds, name)
     config = {"experiment": config_to_json(experiment), "seeds": list(seeds)}
+    found = None
     if resume and (path / "config.json").is_file():
         run = _reopen(path, config, experiment)
     else:
-        _find_or_train_needed(experiment, runs, num_threads)  # a refusal leaves no directory behind
+        found = _find_or_train_needed(experiment, runs, num_threads)  # a refusal leaves no directory behind
         run = RunDir.create(path, config)
     with run.lock():
         if _has_ended(run, experiment):
             return load_run(run)
-        needed = _keep_needed(experiment, run, runs, num_threads)
+        needed = _keep_needed(experiment, run, runs, num_threads, found)
         return train(experiment, seeds, run, needed, num_threads, tensorboard=tensorboard)
 
 
@@ -191,11 +192,13 @@ def _find_or_train_needed(experiment: Experiment, runs: Path, num_threads: int) 
     return needed
 
 
-def _keep_needed(experiment: Experiment, run: RunDir, runs: Path, num_threads: int) -> Trained | None:
-    """The policies a run stands on: those it kept, else found or trained now, and then kept."""
+def _keep_needed(
+    experiment: Experiment, run: RunDir, runs: Path, num_threads: int, found: Trained | None
+) -> Trained | None:
+    """The policies a run stands on: those it kept, else those found before or now, or trained now; and then kept."""
     kept = run.path / NEEDED
     if not kept.is_file():
-        needed = _find_or_train_needed(experiment, runs, num_threads)
+        needed = found or _find_or_train_needed(experiment, runs, num_threads)
         if needed is None:
             return None
         first = one_seed(needed, 0)
@@ -409,7 +412,7 @@ def _look_up(experiment: Experiment, runs: Path) -> tuple[Trained | None, list[s
 
 def _warn_of_passed_over(reasons: list[str], instead: str) -> None:
     for reason in reasons:
-        warnings.warn(f"passed over: {reason}; {instead}", stacklevel=1)  # this line: each is said once
+        warnings.warn(f"passed over: {reason}; {instead}", stacklevel=1)
 
 
 def _load_packaged(row: str) -> Trained:

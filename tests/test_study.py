@@ -1217,7 +1217,8 @@ def test_one_seed_has_no_interval(study):
     assert judging.show_effect(variance.findings[0]) == "-"
 
 
-def test_few_seeds_show_no_probability_and_versions_only_of_what_took_part(study):
+def test_few_seeds_show_no_probability_and_versions_only_of_what_took_part(study, monkeypatch):
+    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
     fill(study, ("walker/plain", "walker/random-start"), 2)
     fill(study, ("bullet/walker/plain", "bullet/walker/random-start"), 1)
     for path in study.runs.rglob("config.json"):

@@ -262,8 +262,10 @@ def test_a_master_on_another_ant_stands_on_policies_of_that_ant(tmp_path):
     row = with_robot(tiny("bandit/hrl/plain"), ROBOTS["stiff"])
     walker = with_robot(EXPERIMENTS["walker/plain"], ROBOTS["stiff"])
     path = finished(tmp_path, walker, "mine")
-    finished(tmp_path, EXPERIMENTS["walker/plain"], "newer")
-    trained = train_row(row, (0,), tmp_path, num_threads=1)
+    finished(tmp_path, EXPERIMENTS["walker/plain"], "seed-0")  # newer, and in its own place by right
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="passed over")
+        trained = train_row(row, (0,), tmp_path, num_threads=1)
     kept = load_policies(Path(trained.source).parent / "needed.safetensors")
     assert kept.experiment == walker
     by_path = replace(row, sub_policies=path)

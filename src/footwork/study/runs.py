@@ -64,14 +64,15 @@ def run_path(runs: Path, row: str, seeds: tuple[int, ...]) -> Path:
 def path_of_new_run(runs: Path, experiment: Experiment, seeds: tuple[int, ...]) -> Path:
     """Where a run lies that was given no name: the row's own place only if its fields are the row's."""
     path = run_path(runs, experiment.name, seeds)
-    try:
-        row = find_row(experiment.name)
-    except ValueError:  # not in the table: the name is all its own
-        return path
-    if same_row(experiment, row):
+    if not is_row(experiment.name) or _is_the_tables(experiment):  # not in the table: the name is all its own
         return path
     fields = json.dumps(config_to_json(_without_length(experiment)), sort_keys=True).encode()
     return path.with_name(f"custom-{hashlib.blake2b(fields, digest_size=4).hexdigest()}-{path.name}")
+
+
+def _is_the_tables(experiment: Experiment) -> bool:
+    """Whether it is a row as the table has it, its length aside, and not with another ant or learner."""
+    return is_row(experiment.name) and same_row(experiment, find_row(experiment.name))
 
 
 def place_of(runs: Path, experiment: Experiment, seeds: tuple[int, ...], name: str | None) -> Path:
@@ -321,7 +322,7 @@ def passed_over(experiment: Experiment, runs: Path) -> tuple[list[str], list[str
                 continue
             if ours and not run.finished:
                 unfinished.append(path.name)
-            elif not ours and path.name.startswith("seed"):
+            elif not ours and path.name.startswith("seed") and _is_the_tables(experiment):  # the row's own place
                 unusable.append(f"{path} was trained with other fields than {experiment.name} has now")
     return unusable, unfinished
 

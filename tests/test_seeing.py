@@ -243,6 +243,7 @@ def test_the_commands_leave_a_page_and_a_video(tmp_path, capsys, monkeypatch):
     assert run(["video", "maze/flat/free", "-o", str(film), *common, "--width", "64", "--height", "48"]) == 0
     out = capsys.readouterr()
     assert "2 episodes, 8 control steps" in out.out
+    assert "maze/flat/penalised: policies from packaged weights" in out.err
     assert out.err.count("no OpenGL here (egl: nothing there; osmesa: nothing there)") == 1
     assert Image.open(film).size == (64, 48)
     render.choose_platform.cache_clear()

@@ -103,6 +103,8 @@ def test_patterns_mean_rows():
     ]
     with pytest.raises(ValueError, match=r"no row matches 'maze/fast/\*'; known rows: walker/\*, "):
         match_rows(["maze/fast/*"])
+    with pytest.raises(ValueError, match=r"unknown row 'maze/hrl/plian'; nearest: .*maze/hrl/plain"):
+        match_rows(["maze/hrl/plian"])
 
 
 # ---------------------------------------------------------------- the plan

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -20,7 +21,7 @@ from footwork.doors.settings import known_fields, read_fields
 from footwork.evaluate import evaluate
 from footwork.record import RunDir, RunError, config_to_json
 from footwork.study.experiments import find_row, is_row
-from footwork.study.runs import NEEDED, PACKAGED, find_needed, find_trained, packaged
+from footwork.study.runs import NEEDED, PACKAGED, find_needed, find_trained, packaged, which_policies
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.tasks.terms import PENALISED_WEIGHTS
 from footwork.train import Experiment, Trained
@@ -44,6 +45,7 @@ def export(
     seed: int = 1_000_003,
     num_threads: int = 0,
     onnx: bool = False,
+    report: Callable[[str], None] | None = None,
 ) -> Path:
     """Write what an address means into the folder ``to``; returns the model card.
 
@@ -55,6 +57,7 @@ def export(
         seed: of the episodes.
         num_threads: of the physics; changes no number.
         onnx: also write ONNX files, those of the first seed; of a master, those of its sub-policies too.
+        report: gets a line that says which policies the address means.
 
     Raises:
         ValueError: the address is unknown.
@@ -67,6 +70,8 @@ def export(
     if to.exists() and not (to.is_dir() and not any(to.iterdir())):
         raise RunError(f"{to} holds something already: choose another folder with --to")
     trained = find_trained(address, runs)
+    if report is not None:
+        report(which_policies(trained))
     needed = find_needed(trained, runs)
     meta = _meta(trained)
     run = RunDir.create(to, {"experiment": config_to_json(trained.experiment), "seeds": list(trained.seeds)})
@@ -81,11 +86,11 @@ def export(
             ]
         shown = film_trained(trained, needed, 1, seed, num_threads=num_threads)
         Replay(tuple(shown), f"Footwork: {trained.experiment.name}").save(to / REPLAY)
-        report = evaluate(trained, needed, episodes, seed, num_threads=num_threads)
-        report["source"] = trained.experiment.name  # not where it lay on this machine
-        write_atomically(to / "evaluation.json", json.dumps(report, indent=2).encode() + b"\n")
+        figures = evaluate(trained, needed, episodes, seed, num_threads=num_threads)
+        figures["source"] = trained.experiment.name  # not where it lay on this machine
+        write_atomically(to / "evaluation.json", json.dumps(figures, indent=2).encode() + b"\n")
         card = to / "README.md"
-        write_atomically(card, _card(trained, needed, meta, report, seed, files, to).encode())
+        write_atomically(card, _card(trained, needed, meta, figures, seed, files, to).encode())
         run.finish({"row": trained.experiment.name, "seeds": list(trained.seeds), "steps": meta["steps"]})
     return card
 

@@ -28,7 +28,7 @@ from footwork.doors.replay import page
 from footwork.doors.visit import FRAMES_PER_SECOND, LESSON_STEPS, SQUARE, House, Seat, Visit, known_walkers
 from footwork.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.physics.skeleton import skeleton
-from footwork.study.runs import find_trained
+from footwork.study.runs import find_trained, which_policies
 
 try:
     from websockets.datastructures import Headers
@@ -264,6 +264,7 @@ def play(row: str, runs: Path, host: str, port: int, seats: int, lesson_steps: i
     trained = find_trained(row, runs)
     if not trained.experiment.is_master:
         raise ValueError(f"play shows masters (maze/hrl/..., bandit/hrl/...), not {trained.experiment.name}")
+    print(which_policies(trained), flush=True)
     house = House(runs, row, seats, lesson_steps)
     server = open_server(house, host, port)
     closing = threading.Thread(target=server.shutdown, name="closing")  # waits for what this thread does

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -22,7 +22,7 @@ from footwork.checkpoint import write_atomically
 from footwork.footage import Footage, film
 from footwork.palette import DIRECTION_COLOURS, FLAT_COLOUR
 from footwork.physics.skeleton import skeleton
-from footwork.study.runs import find_needed, find_trained
+from footwork.study.runs import find_needed, find_trained, which_policies
 from footwork.train import Trained, choices_of
 
 OUTCOMES = {
@@ -81,6 +81,7 @@ def replay(
     deterministic: bool = False,
     most_steps: int | None = None,
     num_threads: int = 0,
+    report: Callable[[str], None] | None = None,
 ) -> Replay:
     """Film episodes of rows and put them side by side, for a notebook or a file.
 
@@ -92,6 +93,7 @@ def replay(
         deterministic: act by the mode of the distribution instead of a sample.
         most_steps: control steps to show of each episode; None: all.
         num_threads: of the physics; changes no number.
+        report: gets a line for each row that says which policies it means.
 
     Raises:
         ValueError: no row, an unknown row, or not at least one episode.
@@ -102,7 +104,7 @@ def replay(
     footage = [
         episode
         for row in rows
-        for episode in film_row(row, runs, episodes, seed, deterministic, num_threads, most_steps)
+        for episode in film_row(row, runs, episodes, seed, deterministic, num_threads, most_steps, report)
     ]
     return Replay(tuple(footage), title="Footwork: " + ", ".join(dict.fromkeys(item.row for item in footage)))
 
@@ -115,9 +117,12 @@ def film_row(
     deterministic: bool = False,
     num_threads: int = 0,
     most_steps: int | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> list[Footage]:
     """Film a row by name, or the run in a directory; of a walker row, ``episodes`` in each direction."""
     trained = find_trained(row, runs)
+    if report is not None:
+        report(which_policies(trained))
     return film_trained(trained, find_needed(trained, runs), episodes, seed, deterministic, num_threads, most_steps)
 
 

@@ -371,13 +371,15 @@ def match_rows(patterns: Iterable[str]) -> list[str]:
     A pattern may be a row's whole address, also of one that :func:`find_row` knows without the table.
 
     Raises:
-        ValueError: a pattern matches no row; lists the groups there are.
+        ValueError: a pattern matches no row; lists the groups there are, or names the nearest rows to an address.
     """
     chosen: dict[str, None] = {}
     wanted = tuple(patterns)
     for pattern in wanted:
         found = _matching(pattern)
         if not found:
+            if not any(sign in pattern for sign in "*?["):
+                raise ValueError(_unknown(pattern))
             groups = ", ".join(dict.fromkeys(f"{group_of(name)}/*" for name in EXPERIMENTS))
             raise ValueError(f"no row matches {pattern!r}; known rows: {groups} (footwork list)")
         chosen.update(dict.fromkeys(found))

@@ -351,8 +351,15 @@ def find_trained(address: str, runs: Path) -> Trained:
             raise ValueError(f"no run lies at {address!r}; {error}") from None
         return _find(row, runs)
     if not run.finished:
-        raise RunError(f"{address} holds an unfinished run: footwork train ROW --resume goes on with it")
+        raise RunError(
+            f"{address} holds an unfinished run of {_experiment_of(run).name}: train --resume goes on with it"
+        )
     return load_run(run)
+
+
+def which_policies(trained: Trained) -> str:
+    """Says which policies an address turned out to mean."""
+    return f"{trained.experiment.name}: policies from {trained.source}"
 
 
 def _run_at(address: str) -> RunDir | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from footwork.doors.commands import say
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Parity:
 
         size = parity.QUICK if self.quick else parity.FULL
         size = size if self.states is None else replace(size, states=self.states)
-        work = parity.Parity(size, self.curves, lambda line: print(line, file=sys.stderr, flush=True))
+        work = parity.Parity(size, self.curves, say)
         work.run()
         for path in write_parity(work.found, self.to):
             print(f"wrote {path}")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from footwork.doors.commands import say
 
 if TYPE_CHECKING:
     from footwork.train import Experiment, Trained
@@ -75,7 +76,7 @@ class Train:
         seeds, physics_threads = tuple(self.seeds), self.threads
         place = place_of(self.runs, experiment, seeds, self.name)
         if self.resume and not (place / "config.json").is_file():
-            print(f"{experiment.name}: nothing to resume in {place}: it begins there", file=sys.stderr)
+            say(f"{experiment.name}: nothing to resume in {place}: it begins there")
         trained = train_row(experiment, seeds, self.runs, self.name, self.resume, physics_threads, self.tensorboard)
         below = stands_on(trained)
         stands = "" if below is None else f", trained on those of {experiment.needs}: {below}"
@@ -121,12 +122,12 @@ class Evaluate:
         """Evaluate, and print the figures."""
         from footwork.doors import tables
         from footwork.evaluate import evaluate
-        from footwork.study.runs import find_needed, find_trained
+        from footwork.study.runs import find_needed, find_trained, which_policies
 
         trained = find_trained(self.row, self.runs)
         needed = find_needed(trained, self.runs)
         trained = _played_on(trained, self.engine)
-        _say_source(trained)
+        say(which_policies(trained))
         _at_least_one("episodes", self.episodes)
         report = evaluate(trained, needed, self.episodes, self.seed, self.deterministic, self.threads)
         if self.json:
@@ -154,10 +155,10 @@ class Transitions:
         """Measure, and print the figures."""
         from footwork.doors import tables
         from footwork.evaluate import transitions
-        from footwork.study.runs import find_trained
+        from footwork.study.runs import find_trained, which_policies
 
         trained = _played_on(find_trained(self.row, self.runs), self.engine)
-        _say_source(trained)
+        say(which_policies(trained))
         _at_least_one("ants", self.ants)
         report = transitions(
             trained,
@@ -166,7 +167,7 @@ class Transitions:
             self.deterministic,
             self.threads,
             orthogonal=self.orthogonal,
-            report=lambda line: print(line, file=sys.stderr),
+            report=say,
         )
         if self.json:
             print(json.dumps(report))
@@ -209,7 +210,7 @@ class Export:
         from footwork.doors.export import export
 
         _at_least_one("episodes", self.episodes)
-        card = export(self.row, self.to, self.runs, self.episodes, self.seed, self.threads, self.onnx)
+        card = export(self.row, self.to, self.runs, self.episodes, self.seed, self.threads, self.onnx, say)
         print(f"{self.row}: exported; the model card is {card}")
         return 0
 
@@ -231,12 +232,7 @@ def _say_rounding(experiment: Experiment) -> None:
 
     steps, one = planned_steps(experiment), steps_per_iteration(experiment)
     if steps != experiment.total_steps:
-        print(f"{experiment.name}: takes {steps:,} control steps, whole iterations of {one:,}", file=sys.stderr)
-
-
-def _say_source(trained: Trained) -> None:
-    """Which policies an address turned out to mean."""
-    print(f"{trained.experiment.name}: policies from {trained.source}", file=sys.stderr)
+        say(f"{experiment.name}: takes {steps:,} control steps, whole iterations of {one:,}")
 
 
 def _at_least_one(name: str, value: int) -> None:

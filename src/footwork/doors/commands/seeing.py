@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+from footwork.doors.commands import say
 
 if TYPE_CHECKING:
     from footwork.doors.replay import Replay as Filmed
@@ -43,6 +44,7 @@ class _Film:
             deterministic=self.deterministic,
             most_steps=self.steps,
             num_threads=self.threads,
+            report=say,
         )
 
 
@@ -81,7 +83,7 @@ class Video(_Film):
 
         check_suffix(self.to.suffix)  # before the work
         look = Look(self.width, self.height, self.fps, self.speed, self.camera, self.quality)
-        path = video(self.film().footage, self.to.suffix, look, _say).save(self.to)
+        path = video(self.film().footage, self.to.suffix, look, say).save(self.to)
         print(f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB")
         return 0
 
@@ -103,7 +105,3 @@ class Play:
 
         play(self.row, self.runs, self.host, self.port, self.seats, self.lesson_steps)
         return 0
-
-
-def _say(line: str) -> None:
-    print(f"footwork: {line}", file=sys.stderr)

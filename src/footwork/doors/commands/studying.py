@@ -10,6 +10,8 @@ from typing import Annotated
 
 import tyro
 
+from footwork.doors.commands import say
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -32,7 +34,7 @@ class Bench:
         from footwork.study import bench, figures
 
         python = self.rivals_python or sys.executable
-        work = bench.Bench(self.quick, self.learning, python, lambda line: print(line, file=sys.stderr))
+        work = bench.Bench(self.quick, self.learning, python, say)
         work.run()
         report = work.report()
         text = json.dumps(report, indent=2)
@@ -42,7 +44,7 @@ class Bench:
             tables.show(*tables.bench_tables(report))
         self.to.mkdir(parents=True, exist_ok=True)
         write_atomically(self.to / "report.json", text.encode() + b"\n")
-        print(f"wrote {figures.bench_figure(self.to / 'bench.png', report)}", file=sys.stderr)
+        say(f"wrote {figures.bench_figure(self.to / 'bench.png', report)}")
         return 0 if work.complete else 130
 
 

@@ -275,7 +275,7 @@ def test_a_master_on_another_ant_stands_on_policies_of_that_ant(tmp_path):
 def test_an_unfinished_run_is_no_address(tmp_path):
     experiment = tiny("walker/plain")
     run = RunDir.create(tmp_path / "begun", {"experiment": config_to_json(experiment), "seeds": [0]})
-    with pytest.raises(RunError, match=r"unfinished run of .+: train --resume goes on with it"):
+    with pytest.raises(RunError, match=r"unfinished run: footwork train \S+ --resume, "):
         find_trained(str(run.path), tmp_path)
 
 

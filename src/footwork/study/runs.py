@@ -351,8 +351,10 @@ def find_trained(address: str, runs: Path) -> Trained:
             raise ValueError(f"no run lies at {address!r}; {error}") from None
         return _find(row, runs)
     if not run.finished:
+        row = _experiment_of(run).name
         raise RunError(
-            f"{address} holds an unfinished run of {_experiment_of(run).name}: train --resume goes on with it"
+            f"{address} holds an unfinished run: footwork train {row} --resume, and whatever options it was begun "
+            f"with, goes on with it"
         )
     return load_run(run)
 

@@ -351,9 +351,9 @@ def find_trained(address: str, runs: Path) -> Trained:
             raise ValueError(f"no run lies at {address!r}; {error}") from None
         return _find(row, runs)
     if not run.finished:
-        row = _experiment_of(run).name
+        name = _experiment_of(run).name
         raise RunError(
-            f"{address} holds an unfinished run: footwork train {row} --resume, and whatever options it was begun "
+            f"{address} holds an unfinished run: footwork train {name} --resume, and whatever options it was begun "
             f"with, goes on with it"
         )
     return load_run(run)

@@ -222,6 +222,15 @@ def test_no_more_runs_at_once_than_memory_holds(stage, monkeypatch, runs_of_room
     assert any("not enough memory" in line for line in stage.said) == (most < 2)
 
 
+def test_a_run_waits_while_others_hold_the_memory_that_was_free_at_the_start(stage, monkeypatch):
+    need = sweep.megabytes_of(stage.study, stage.jobs[0])
+    free = iter([10 * need, 10 * need])  # at the start, and when the first runs begin; then another program grows
+    monkeypatch.setattr(sweep, "free_megabytes", lambda: next(free, 0.5 * need))
+    board = stage.run(workers=2)
+    assert len(board.done) == len(stage.jobs)  # one at a time
+    assert any("not enough memory" in line for line in stage.said)
+
+
 def test_runs_of_large_ants_need_more_memory():
     def gigabytes(row):
         return sweep.megabytes_of(Study("runs", FULL), Job(row, 0, None, 1)) / 1e3

@@ -281,7 +281,7 @@ def _run_local(board: Board, workers: int, log: Callable[[str], None]) -> None:
                     need, free = megabytes_of(board.study, lacking) / 1e3, (memory or 0) / 1e3
                     log(
                         f"{lacking.name}, and perhaps others, waits: it takes {need:.1f} GB, and of the {free:.1f} GB "
-                        f"that were free at the start there is not enough memory left beside what runs"
+                        f"that were free at the start there is not enough memory left beside what runs here"
                     )
                     said = True
                 time.sleep(POLL)
@@ -323,16 +323,23 @@ def _start_ready(
 ) -> Job | None:
     """Give every idle core the next run for which there is room beside the others.
 
+    Room is what was free at the start less what this sweep's runs will take, and no more than what is free now: other
+    programs, another sweep among them, may have taken some of it since.
+
     Args:
         board: knows which runs are ready.
         cores: one for each place.
         at_work: by place; those that start are added.
-        memory: MB for all of them; None where it is not known.
+        memory: MB that were free at the start; None where it is not known.
 
     Returns:
         A run that a core is idle for, but no memory.
     """
-    room = math.inf if memory is None else memory - sum(megabytes_of(board.study, job) for job in board.active)
+    if len(at_work) == len(cores):
+        return None
+    free, room = free_megabytes(), math.inf
+    if memory is not None and free is not None:
+        room = min(memory - sum(megabytes_of(board.study, job) for job in board.active), free)
     for place, core in enumerate(cores):
         if place in at_work:
             continue

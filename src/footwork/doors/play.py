@@ -264,7 +264,7 @@ def play(row: str, runs: Path, host: str, port: int, seats: int, lesson_steps: i
     trained = find_trained(row, runs)
     if not trained.experiment.is_master:
         raise ValueError(f"play shows masters (maze/hrl/..., bandit/hrl/...), not {trained.experiment.name}")
-    print(which_policies(trained), flush=True)
+    print(which_policies(trained), file=sys.stderr, flush=True)
     house = House(runs, row, seats, lesson_steps)
     server = open_server(house, host, port)
     closing = threading.Thread(target=server.shutdown, name="closing")  # waits for what this thread does

@@ -519,7 +519,7 @@ def test_ctrl_c_closes_cleanly(learns):
                 hear(visitor, "nothing more")
     out, err = process.communicate(timeout=120)
     lesson = "a lesson finishes what it is at, or compiling; Ctrl-C again does not wait\n" if learns else ""
-    assert (process.returncode, out, err) == (0, f"closing\n{lesson}", "")
+    assert (process.returncode, out, err) == (0, f"closing\n{lesson}", f"{ROW}: policies from packaged weights\n")
 
 
 def test_a_signal_before_the_server_serves_closes_it_too(monkeypatch):

@@ -1282,7 +1282,7 @@ def test_a_study_on_an_engine_that_is_missing_is_refused_before_anything_is_begu
         (["figures", "--runs", ".", "--under", "light"], "no finished runs under 'light'"),
         (["figures", "--runs", "nowhere"], "there is no folder of runs at nowhere"),
         (["report", "--runs", "nowhere"], "there is no folder of runs at nowhere"),
-        (["reproduce", "--rows", "maze/none"], "no row matches 'maze/none'"),
+        (["reproduce", "--rows", "maze/none"], "unknown row 'maze/none'; nearest: "),
         (["reproduce", "--launcher", "slurm", "--rows", "walker/plain"], "known launchers: local, ray"),
         (["reproduce", "--seeds", "0"], "seeds must be >= 1"),
         (["reproduce", "--workers", "-1", "--rows", "walker/plain"], "workers must be >= 0"),

@@ -264,7 +264,6 @@ def play(row: str, runs: Path, host: str, port: int, seats: int, lesson_steps: i
     trained = find_trained(row, runs)
     if not trained.experiment.is_master:
         raise ValueError(f"play shows masters (maze/hrl/..., bandit/hrl/...), not {trained.experiment.name}")
-    print(which_policies(trained), file=sys.stderr, flush=True)
     house = House(runs, row, seats, lesson_steps)
     server = open_server(house, host, port)
     closing = threading.Thread(target=server.shutdown, name="closing")  # waits for what this thread does
@@ -278,6 +277,7 @@ def play(row: str, runs: Path, host: str, port: int, seats: int, lesson_steps: i
     # A handler that asks and does not raise: before it serves, a server that is interrupted would never be closed.
     old = [(number, signal.signal(number, close)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
+        print(which_policies(trained), file=sys.stderr, flush=True)
         print(f"{address_of(server)}   (Ctrl-C ends it)", flush=True)
         server.serve_forever()
         print("closing", flush=True)

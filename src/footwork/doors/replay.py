@@ -120,10 +120,18 @@ def film_row(
     report: Callable[[str], None] | None = None,
 ) -> list[Footage]:
     """Film a row by name, or the run in a directory; of a walker row, ``episodes`` in each direction."""
+    _check_amounts(episodes, most_steps)  # before anything is said
     trained = find_trained(row, runs)
     if report is not None:
         report(which_policies(trained))
     return film_trained(trained, find_needed(trained, runs), episodes, seed, deterministic, num_threads, most_steps)
+
+
+def _check_amounts(episodes: int, most_steps: int | None) -> None:
+    if episodes < 1:
+        raise ValueError(f"episodes must be >= 1, got {episodes}")
+    if most_steps is not None and most_steps < 1:
+        raise ValueError(f"steps must be >= 1, got {most_steps}")
 
 
 def film_trained(
@@ -140,10 +148,7 @@ def film_trained(
     Raises:
         ValueError: not at least one episode, or one step.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes must be >= 1, got {episodes}")
-    if most_steps is not None and most_steps < 1:
-        raise ValueError(f"steps must be >= 1, got {most_steps}")
+    _check_amounts(episodes, most_steps)
     subs = choices_of(trained.experiment, needed)
     count = episodes * (len(DIRECTIONS) if trained.experiment.is_walker else 1)
     return film(trained, subs, count, seed, 0, deterministic, num_threads, most_steps)

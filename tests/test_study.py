@@ -43,6 +43,7 @@ from footwork.study.experiments import (
     INTERLEAVED_WITHOUT,
     LIGHT_WITH_BONUS,
     MAIN,
+    MORE_REGULARISED_MASTERS,
     PAPER_MASTERS_VARIED,
     SCHEDULES,
     find_row,
@@ -767,6 +768,15 @@ def test_each_part_of_interleaving_is_left_out_alone():
     assert replace(row, name=plain.name, regulariser=None) == plain  # nothing is left but the exchange
 
 
+def test_masters_on_more_regularised_sub_policies_are_those_of_their_kind():
+    assert len(MORE_REGULARISED_MASTERS) == 4
+    for row in MORE_REGULARISED_MASTERS:
+        _, place, rest = row.name.split("/", 2)
+        assert row.sub_policies == f"ablation/{rest.removeprefix('hrl-')}"
+        of_its_kind = find_row(f"{place}/{rest.replace('hrl-', 'hrl/').partition('/t/')[0]}")
+        assert row == replace(of_its_kind, name=row.name, sub_policies=row.sub_policies)
+
+
 def test_the_light_ants_sub_policies_get_no_bonus():
     light = [row for name, row in EXPERIMENTS.items() if name.startswith("light/")]
     assert {row.ppo.ent_coef for row in light if row.is_walker and row != LIGHT_WITH_BONUS} == {0.0}
@@ -1059,6 +1069,7 @@ def test_kinds_of_sub_policies_stand_side_by_side_with_their_masters(study):
     fill(study, ("maze/paper/plain",), 1)
     fill(study, ("bandit/flat/free", "ablation/annealed/plain"), claims.MIN_SEEDS)
     fill(study, ("ablation/maze/hrl-annealed/plain",), 2)
+    fill(study, ("ablation/random-repeated/t/25", "ablation/maze/hrl-random-repeated/t/25"), 1)
     for seed, idle in enumerate((0.30, 0.40, 0.50)):
         write_switching(study, "walker/plain", seed, idle, 0.1)
         write_switching(study, "light/walker/plain", seed, 0.0, 0.2)
@@ -1071,17 +1082,19 @@ def test_kinds_of_sub_policies_stand_side_by_side_with_their_masters(study):
     for seed in range(2):
         write_success(study, "ablation/maze/hrl-annealed/plain", seed, 0.125)
     write_success(study, "maze/paper/plain", 0, 0.0)
+    write_success(study, "ablation/maze/hrl-random-repeated/t/25", 0, 0.375)
     found = results.Results(study)
     table = row_tables.side_by_side(found)
-    assert table.header[:4] == ("sub-policies", "hand-overs", "idle, k = 50", "upside down, k = 50")
-    assert table.header[4:] == (
+    assert table.header[:5] == ("sub-policies", "m/s", "hand-overs", "idle, k = 50", "upside down, k = 50")
+    assert table.header[5:] == (
         "AntBandit, our reward",
         "AntMaze, our reward",
         "AntBandit, the paper's",
         "AntMaze, the paper's",
     )
-    lines = {line[0]: [*line[2:]] for line in table.rows}
-    assert list(lines) == ["plain", "plain, annealed", "flat policy, free", "light/plain"]
+    lines = {line[0]: [*line[3:]] for line in table.rows}
+    assert list(lines) == ["plain", "plain, annealed", "random-repeated, t = 25", "flat policy, free", "light/plain"]
+    assert lines["random-repeated, t = 25"][2:] == ["-", "37.5 (1)", "", ""]
     assert lines["plain"][0].startswith("40.0 [30.0, 50.0]")
     assert lines["plain"][1:] == ["10.0 [10.0, 10.0] (3)", "60.0 [50.0, 70.0] (3)", "-", "-", "0.0 (1)"]
     assert lines["plain, annealed"] == ["60.0 [60.0, 60.0]", "90.0 [90.0, 90.0]", "-", "12.5 [12.5, 12.5] (2)", "", ""]

@@ -18,6 +18,7 @@ from footwork.study.experiments import (
     GRIDS_BY_NAME,
     INTERLEAVED_WITHOUT,
     INTERLEAVED_WITHOUT_MASTERS,
+    MORE_REGULARISED_MASTERS,
     PAPER_MASTERS_VARIED,
     in_braces,
     is_row,
@@ -189,8 +190,19 @@ ANSWERS: tuple[Answer, ...] = (
     Answer(
         "6",
         "Random start, random repeated, appropriate bias: t timesteps (not stated)",
-        figures=(14,),
-        shows=_grid("handover", *_LENGTHS),
+        figures=(14, 19),
+        shows=(
+            *_grid("handover", *_LENGTHS),
+            *_grid("upside down", *_LENGTHS),
+            *(
+                _rows(
+                    "success",
+                    *(f"{place}/hrl/{kind}" for kind in ("random-repeated", "appropriate-bias")),
+                    *(row.name for row in MORE_REGULARISED_MASTERS if f"/{place}/" in row.name),
+                )
+                for place in ("bandit", "maze")
+            ),
+        ),
     ),
     Answer("6", "Appropriate bias seems to work best", (10,), (11, 12)),
     Answer("6", "Transitions take place successfully almost always", (11,), (11,)),

@@ -245,6 +245,7 @@ FLAT_GRIDS: dict[str, str] = {
     "ablation/bandit/flat-penalised-bonus": "without an entropy bonus",
 }
 GRIDS_BY_NAME: dict[str, Grid] = {grid.name: grid for grid in GRIDS}
+_ON_GRIDS = {row.name: row for grid in GRIDS for row in grid.rows()}
 
 # Annealing is one of the things that interleaved rows have besides their regulariser. The paper's rows with it.
 ANNEALED: tuple[Experiment, ...] = tuple(
@@ -298,6 +299,12 @@ PAPER_MASTERS_VARIED: tuple[Experiment, ...] = tuple(
 
 ANNEALED_MASTERS = _masters_on(ANNEALED)
 INTERLEAVED_WITHOUT_MASTERS = _masters_on(INTERLEAVED_WITHOUT, "interleaved")
+# Sub-policies that are regularised more than we do, and that were seen (seed 0) to hand over more safely and to walk
+# slower: is that worth it to a master?
+MORE_REGULARISED_MASTERS = (
+    *_masters_on([_ON_GRIDS["ablation/random-repeated/t/25"]], "random-repeated"),
+    *_masters_on([_ON_GRIDS["ablation/appropriate-bias/t/400"]], "appropriate-bias"),
+)
 
 
 def _without_bonus(row: Experiment) -> Experiment:
@@ -342,9 +349,16 @@ LIGHT_WITH_BONUS = _of_robot(
 
 EXPERIMENTS: dict[str, Experiment] = {
     **MAIN,
-    **{row.name: row for grid in GRIDS for row in grid.rows()},
+    **_ON_GRIDS,
     **{row.name: row for row in PAPER_MASTERS_VARIED},
-    **{row.name: row for row in (*ANNEALED, *ANNEALED_MASTERS, *INTERLEAVED_WITHOUT, *INTERLEAVED_WITHOUT_MASTERS)},
+    **{
+        row.name: row
+        for row in (
+            *(*ANNEALED, *ANNEALED_MASTERS),
+            *(*INTERLEAVED_WITHOUT, *INTERLEAVED_WITHOUT_MASTERS),
+            *MORE_REGULARISED_MASTERS,
+        )
+    },
     **{row.name: row for row in (*(_of_robot(row, ROBOTS["light"]) for row in LIGHT), LIGHT_WITH_BONUS)},
 }
 

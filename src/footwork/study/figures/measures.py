@@ -19,6 +19,7 @@ from footwork.study.experiments import (
     INTERLEAVED_WITHOUT,
     INTERLEAVED_WITHOUT_MASTERS,
     LIGHT_WITH_BONUS,
+    MORE_REGULARISED_MASTERS,
     PAPER_MASTERS_VARIED,
     Grid,
     find_row,
@@ -174,7 +175,7 @@ def k_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
     """What the length t of each regulariser does to sub-policies."""
-    return grid_panels(results, _grids("t"), ("handover", "moving", "speed"), 2.3)
+    return grid_panels(results, _grids("t"), ("handover", "moving", "upside down", "speed"), 2.1)
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
@@ -193,8 +194,13 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
             ("handover", "moving", "speed"),
         ),
         (
-            "annealing, parts of interleaving, the ant: masters",
-            [*_ANNEALED_MASTERS, *_WITHOUT_MASTERS, *(row for row in _OF_ANTS if not find_row(row).is_walker)],
+            "annealing, parts of interleaving, more regularisation, the ant: masters",
+            [
+                *_ANNEALED_MASTERS,
+                *_WITHOUT_MASTERS,
+                *_MORE_REGULARISED_MASTERS,
+                *(row for row in _OF_ANTS if not find_row(row).is_walker),
+            ],
             ("way", "route", "success"),
         ),
     )
@@ -241,6 +247,7 @@ _WITHOUT_MASTERS = (
     "maze/hrl/interleaved",
     *(row.name for row in INTERLEAVED_WITHOUT_MASTERS if "/maze/" in row.name),
 )
+_MORE_REGULARISED_MASTERS = tuple(row.name for row in MORE_REGULARISED_MASTERS if "/maze/" in row.name)
 # What :func:`comparisons` reads.
 COMPARED: tuple[str, ...] = tuple(
     dict.fromkeys(
@@ -251,6 +258,7 @@ COMPARED: tuple[str, ...] = tuple(
             *_ANNEALED_MASTERS,
             *_WITHOUT,
             *_WITHOUT_MASTERS,
+            *_MORE_REGULARISED_MASTERS,
             _WITH_BONUS,
             *_OF_ANTS,
         )

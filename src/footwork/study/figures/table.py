@@ -182,7 +182,8 @@ FIGURES: tuple[Figure, ...] = (
         "14-regulariser-length",
         "The length t of each regulariser",
         f"{_INTERVALS}. Hand-overs between orthogonal directions, one at a time; options that get "
-        "on when the direction is drawn anew every 50 control steps; speed without hand-overs.",
+        "on, and ants on their backs in the end, when the direction is drawn anew every 50 control steps; speed "
+        "without hand-overs.",
         measures.t_grids,
         measures.rows_of_grids("t"),
         once=True,
@@ -239,7 +240,7 @@ FIGURES: tuple[Figure, ...] = (
     ),
     Figure(
         "19-choices",
-        "What the paper leaves open: B, k, the potential, bonus and annealing, the ant; and parts of interleaving",
+        "What the paper leaves open: B, k, t, the potential, bonus and annealing, the ant; and parts of interleaving",
         f"{_INTERVALS}; in brackets the number of seeds. There are walls to go around on AntMaze "
         "only. k-paper-200, B-as-size-paper: the paper's reward and schedule with options of 200 control steps, with "
         "minibatches of 32. The entropy bonus is 0.02 where a name does not say otherwise (annealed and interleaved "

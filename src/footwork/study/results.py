@@ -9,20 +9,27 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from footwork.physics import libraries_of
-from footwork.record import RunDir, RunError, config_from_json, device_in
+from footwork.record import RunDir, RunError, device_in
 from footwork.statistics import Effect, Floats, contrast, generator_for
 from footwork.study.experiments import EXPERIMENTS, MAIN, is_row
 from footwork.study.measure import EVALUATION, problem_with
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
-from footwork.study.runs import RUN_FILES, how_to_reproduce, how_to_train_again
+from footwork.study.runs import (
+    RUN_FILES,
+    experiment_of,
+    how_to_reproduce,
+    how_to_train_again,
+    of_another_version,
+    same_row,
+)
 from footwork.study.training_curves import Curve, of_seed, read_curve
 from footwork.train import Experiment, planned_steps
 
@@ -243,22 +250,15 @@ def _saved(run: RunDir) -> tuple[Experiment, list[int]]:
     Raises:
         RunError: config.json is damaged, or of a version with other fields.
     """
-    config = run.config()
-    try:
-        seeds = config["seeds"]
-        if not seeds or any(type(seed) is not int for seed in seeds):
-            raise ValueError(f"its seeds are {seeds!r}")
-        run.versions()
-        return config_from_json(Experiment, config["experiment"]), list(seeds)
-    except RunError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:
-        version = run.versions().get("footwork", "unknown")
-        raise RunError(f"{run.path} is of another version of footwork ({version}): {error}") from None
+    experiment, seeds = experiment_of(run), run.config().get("seeds")
+    run.versions()
+    if not isinstance(seeds, list) or not seeds or any(type(seed) is not int for seed in seeds):
+        raise of_another_version(run, f"its seeds are {seeds!r}")
+    return experiment, list(seeds)
 
 
 def _why_not(run: RunDir, saved: Experiment, row: Experiment, any_length: bool) -> LeftOut | None:
-    if replace(saved, total_steps=row.total_steps) != row:
+    if not same_row(saved, row):
         return LeftOut(f"{run.path} was trained with other fields than {row.name} has now: left out")
     if not run.finished:
         return LeftOut(f"{run.path} is not finished: left out", unfinished=True)

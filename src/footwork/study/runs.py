@@ -278,23 +278,29 @@ def _finished(experiment: Experiment, runs: Path) -> list[RunDir]:
 def _counts_as(run: RunDir, experiment: Experiment) -> bool:
     try:
         run.summary()
-        return same_row(_experiment_of(run), experiment)
+        return same_row(experiment_of(run), experiment)
     except ValueError:  # damaged, or of a version with other fields: passed_over tells of it
         return False
 
 
-def _experiment_of(run: RunDir) -> Experiment:
+def experiment_of(run: RunDir) -> Experiment:
     """What a run trained.
 
     Raises:
         RunError: its config.json is missing, damaged or of a version with other fields.
     """
-    config = run.config().get("experiment")
     try:
-        return config_from_json(Experiment, config)
+        return config_from_json(Experiment, run.config().get("experiment"))
+    except RunError:
+        raise
     except ValueError as error:
-        version = run.versions().get("footwork", "unknown")
-        raise RunError(f"{run.path} is of another version of footwork ({version}): {error}") from None
+        raise of_another_version(run, str(error)) from None
+
+
+def of_another_version(run: RunDir, why: str) -> RunError:
+    """What is raised of a run whose config.json this version cannot make sense of."""
+    version = run.versions().get("footwork", "unknown")
+    return RunError(f"{run.path} is of another version of footwork ({version}): {why}")
 
 
 def passed_over(experiment: Experiment, runs: Path) -> tuple[list[str], list[str]]:
@@ -314,7 +320,7 @@ def passed_over(experiment: Experiment, runs: Path) -> tuple[list[str], list[str
         elif any((path / name).exists() for name in RUN_FILES):
             run = RunDir(path)
             try:
-                ours = same_row(_experiment_of(run), experiment)
+                ours = same_row(experiment_of(run), experiment)
                 if ours and run.finished:
                     run.summary()
             except ValueError as error:  # it names the file
@@ -351,7 +357,7 @@ def find_trained(address: str, runs: Path) -> Trained:
             raise ValueError(f"no run lies at {address!r}; {error}") from None
         return _find(row, runs)
     if not run.finished:
-        name = _experiment_of(run).name
+        name = experiment_of(run).name
         raise RunError(
             f"{address} holds an unfinished run: footwork train {name} --resume, and whatever options it was begun "
             f"with, goes on with it"

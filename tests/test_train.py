@@ -418,10 +418,11 @@ def test_the_command_says_what_a_run_stands_on_and_where_it_goes_on(tmp_path, ca
     said = capsys.readouterr()
     assert re.search(r"nothing to resume in .*/bandit/hrl/plain/custom-\w+-seed-0: it begins there", said.err)
     assert "takes 24 control steps, whole iterations of 24" in said.err
+    assert f"stands on walker/plain, {PACKAGED}" in said.err
     assert f"trained on those of walker/plain: {PACKAGED}" in said.out
     assert run([*command, "--total-steps", "48"]) == 0
     said = capsys.readouterr()
-    assert "goes on from step 24 of 48" in said.err
+    assert re.search(f"stands on walker/plain, {PACKAGED}.*goes on from step 24 of 48", said.err, re.DOTALL)
     assert "nothing to resume" not in said.err
     assert "takes" not in said.err
     place = next(tmp_path.glob("bandit/hrl/plain/custom-*"))

@@ -306,7 +306,7 @@ def train(
     with closing(env.physics):
         learning = _resume(run, env, begin_learning(experiment, env, seeds))
         _check_not_beyond(experiment, run, learning)
-        learning = _learn(experiment, env, learning, seeds, run, compiling, checkpoint_seconds, tensorboard)
+        learning = _learn(experiment, env, learning, seeds, run, needed, compiling, checkpoint_seconds, tensorboard)
         total = planned_steps(experiment)
         if not env.physics.restore_alters:
             _save(run, env, learning, total)
@@ -326,6 +326,7 @@ def _learn(
     learning: Learning,
     seeds: tuple[int, ...],
     run: RunDir,
+    needed: Trained | None,
     compiling: Future[None],
     checkpoint_seconds: float,
     tensorboard: bool,
@@ -339,6 +340,8 @@ def _learn(
         Progress(total, experiment.name, initial_step=step) as progress,
         _stop_signals() as stop_asked,
     ):
+        if needed is not None:
+            progress.say(f"stands on {needed.experiment.name}, {needed.source}")
         if step > 0:
             progress.say(f"goes on from step {step:,} of {total:,}")
         while step < total:

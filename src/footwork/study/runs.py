@@ -196,7 +196,10 @@ def _find_or_train_needed(experiment: Experiment, runs: Path, num_threads: int) 
 def _keep_needed(
     experiment: Experiment, run: RunDir, runs: Path, num_threads: int, found: Trained | None
 ) -> Trained | None:
-    """The policies a run stands on: those it kept, else those found before or now, or trained now; and then kept."""
+    """The policies a run stands on: those it kept, else those found before or now, or trained now; and then kept.
+
+    Their source is where they came from.
+    """
     kept = run.path / NEEDED
     if not kept.is_file():
         needed = found or _find_or_train_needed(experiment, runs, num_threads)
@@ -205,7 +208,12 @@ def _keep_needed(
         first = one_seed(needed, 0)
         meta = policy_meta(needed.experiment, first.seeds, planned_steps(needed.experiment))
         checkpoint.save(kept, first.params, {**meta, "from": needed.source})
-    return load_policies(kept)
+    return load_policies(kept)._replace(source=_origin(kept))
+
+
+def _origin(kept: Path) -> str:
+    """Where policies came from that a run keeps beside its own."""
+    return str(checkpoint.load_arrays(kept)[1].get("from", kept))
 
 
 def stands_on(trained: Trained) -> str | None:
@@ -215,7 +223,7 @@ def stands_on(trained: Trained) -> str | None:
         CheckpointError: their file is damaged.
     """
     kept = Path(trained.source).parent / NEEDED
-    return str(checkpoint.load_arrays(kept)[1].get("from", kept)) if kept.is_file() else None
+    return _origin(kept) if kept.is_file() else None
 
 
 def _check_fit(experiment: Experiment, needed: Trained) -> None:

@@ -138,9 +138,14 @@ def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, .
             ax.set_xticks(x, [f"{v}\n{n}" for v, n in zip(values, counts, strict=True)])
             ax.minorticks_off()
             ax.set_ylim(limits)
-            ax.set_title(grid.name.removeprefix("ablation/"))
-            ax.set_xlabel(f"{grid.words};\nbelow: seeds")
-        line[0].set_ylabel(_wrapped(METRICS[metric].words))
+            ax.tick_params(labelleft=ax is line[0])
+            if metric == metrics[0]:
+                ax.set_title(grid.name.removeprefix("ablation/"))
+            if metric == metrics[-1]:
+                ax.set_xlabel(f"{grid.words};\nbelow: seeds")
+        one = METRICS[metric]
+        words = one.words if one.is_share else f"{one.words} ({one.unit})"
+        line[0].set_ylabel(_wrapped(words, round(11 * height)))  # no longer than a panel is high
     return figure
 
 
@@ -175,7 +180,7 @@ def k_grids(results: Results, rows: tuple[str, ...]) -> Any:
 
 def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
     """What the length t of each regulariser does to sub-policies."""
-    return grid_panels(results, _grids("t"), ("handover", "moving", "upside down", "speed"), 2.1)
+    return grid_panels(results, _grids("t"), ("handover", "moving", "upside down", "speed"), 1.9)
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:

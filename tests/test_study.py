@@ -1149,9 +1149,24 @@ def test_a_way_that_was_lost_lies_within_its_panel(study):
         content["by_seed"][0]["way"] = 0.9 if k == 10 else -1.4 - seed / 10
         write(path, content)
     panels = measures.k_grids(results.Results(study), ()).axes
-    (way,) = (ax for ax in panels if ax.get_title() == "bandit/k" and ax.dataLim.y0 < 0)
+    (way,) = (ax for ax in panels if ax.dataLim.y0 < 0)
     assert way.get_ylim()[0] < -1.5
     assert way.get_ylim()[1] > 1.0
+
+
+def test_lengths_of_a_regulariser_make_a_line_from_safe_to_fast(study):
+    rows = ("ablation/random-repeated/t/25", "walker/random-repeated", "ablation/annealed/random-repeated")
+    fill(study, rows, 2)
+    for row, idle in zip(rows, (0.2, 0.4, 0.6), strict=True):
+        write_switching(study, row, 0, idle, 0.1)
+        write_switching(study, row, 1, idle, 0.1)
+    (ax, _) = measures.safety_against_speed(results.Results(study), measures.LENGTHS_AND_KINDS).axes
+    lengths, annealed = (line for line in ax.lines if line.get_marker() != "None")
+    assert [*lengths.get_ydata()] == pytest.approx([0.2, 0.4])
+    assert [text.get_text() for text in ax.texts] == ["25", "100", ""]
+    assert [*annealed.get_ydata()] == pytest.approx([0.6])
+    assert (lengths.get_mfc(), annealed.get_mfc()) == (lengths.get_color(), "white")
+    assert lengths.get_color() == annealed.get_color()
 
 
 def test_masters_are_set_beside_their_own_sub_policies(study):

@@ -190,7 +190,7 @@ ANSWERS: tuple[Answer, ...] = (
     Answer(
         "6",
         "Random start, random repeated, appropriate bias: t timesteps (not stated)",
-        figures=(14, 19),
+        figures=(14, 19, 22),
         shows=(
             *_grid("handover", *_LENGTHS),
             *_grid("upside down", *_LENGTHS),
@@ -304,7 +304,7 @@ ANSWERS: tuple[Answer, ...] = (
         "ours",
         "Interleaved sub-policies; one symmetric policy",
         (14, 15),
-        (11, 12, 19),
+        (11, 12, 19, 22),
         shows=(
             *(
                 _rows(metric, "walker/interleaved", *(row.name for row in INTERLEAVED_WITHOUT))

@@ -18,6 +18,7 @@ from footwork.study.experiments import (
     GRIDS,
     INTERLEAVED_WITHOUT,
     INTERLEAVED_WITHOUT_MASTERS,
+    KINDS,
     LIGHT_WITH_BONUS,
     MORE_REGULARISED_MASTERS,
     PAPER_MASTERS_VARIED,
@@ -181,6 +182,59 @@ def k_grids(results: Results, rows: tuple[str, ...]) -> Any:
 def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
     """What the length t of each regulariser does to sub-policies."""
     return grid_panels(results, _grids("t"), ("handover", "moving", "upside down", "speed"), 1.9)
+
+
+def _lines_of_kinds() -> tuple[tuple[str, dict[Any, str]], ...]:
+    """Rows of sub-policies by what stands beside them, in lines: lengths of a regulariser, and single rows."""
+    lengths = {grid.base: grid.points() for grid in _grids("t")}
+    own = (f"walker/{kind}" for kind in KINDS)
+    return (
+        *((row, lengths.get(row, {"": row})) for row in own),
+        *((row.name, {"": row.name}) for row in ANNEALED),
+        ("walker/interleaved", {"": UNANNEALED}),
+    )
+
+
+UNANNEALED = "ablation/interleaved-without/annealing"
+# What :func:`safety_against_speed` reads.
+LENGTHS_AND_KINDS: tuple[str, ...] = tuple(
+    dict.fromkeys(row for _, points in _lines_of_kinds() for row in points.values())
+)
+
+
+def safety_against_speed(results: Results, rows: tuple[str, ...]) -> Any:
+    """Idle options and ants on their backs under random switching, against the speed straight on."""
+    prefix = next(row for row in rows if "walker/" in row).partition("walker/")[0]
+    figure, axes = panels(1, 2, 4.2)
+    for ax, metric in zip(axes[0], ("idle", "upside down"), strict=True):
+        for named, points in _lines_of_kinds():
+            there = [(value, prefix + row) for value, row in points.items() if prefix + row in rows]
+            found = [(value, row, results.middle(row, "speed"), results.middle(row, metric)) for value, row in there]
+            whole = [(value, row, x, y) for value, row, x, y in found if x is not None and y is not None]
+            if not whole:
+                continue
+            look = look_of(named)
+            face = look.colour if find_row(whole[0][1]).ppo.anneal_updates is None else "white"
+            for value, _, x, y in whole:
+                ax.plot([x.low, x.high], [y.estimate] * 2, color=look.colour, lw=1.3, alpha=0.5)
+                ax.plot([x.estimate] * 2, [y.low, y.high], color=look.colour, lw=1.3, alpha=0.5)
+                at, look_like = (x.estimate, y.estimate), {"fontsize": 6.5, "color": look.colour}
+                ax.annotate(f"{value}", at, (4, 3), textcoords="offset points", **look_like)
+            ax.plot(
+                [x.estimate for *_, x, _ in whole],
+                [y.estimate for *_, y in whole],
+                **{"color": look.colour, "marker": look.mark, "mfc": face, "ms": 5, "lw": 0.8},
+                label=named.rpartition("/")[2],
+            )
+        if not ax.lines:
+            empty(ax, "no finished runs yet")
+            continue
+        ax.set_xlabel("speed along the direction (m/s)")
+        ax.set_ylabel(_wrapped(METRICS[metric].words, 44))
+        ax.set_ylim(-0.02, None)
+        ax.set_xlim(0, None)
+    legend_below(figure, list(axes[0]), columns=4)
+    return figure
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:

@@ -278,6 +278,16 @@ FIGURES: tuple[Figure, ...] = (
         tuple(dict.fromkeys(row for association in ASSOCIATIONS for row in association.rows)),
         about=tuple(row for association in ASSOCIATIONS for row in association.masters),
     ),
+    Figure(
+        "22-safety-against-speed",
+        "Safety against speed",
+        "Sub-policies of every kind, and of other lengths of a regulariser (the number beside a point: t, or the mean "
+        "stay of interleaved ones, in control steps). Right: fast straight on; low: safe when the direction is drawn "
+        "anew every 50 control steps. Filled: Table 1's constant learning rate; white: annealed. Interquartile means "
+        "over seeds, bars 95 % intervals (of three seeds or fewer: their range).",
+        measures.safety_against_speed,
+        measures.LENGTHS_AND_KINDS,
+    ),
 )
 
 

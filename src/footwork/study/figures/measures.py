@@ -231,7 +231,7 @@ def safety_against_speed(results: Results, rows: tuple[str, ...]) -> Any:
             continue
         ax.set_xlabel("speed along the direction (m/s)")
         ax.set_ylabel(_wrapped(METRICS[metric].words, 44))
-        ax.set_ylim(-0.02, None)
+        ax.set_ylim(-0.02, max(ax.get_ylim()[1], 0.1))  # one ant is no tower
         ax.set_xlim(0, None)
     legend_below(figure, list(axes[0]), columns=4)
     return figure

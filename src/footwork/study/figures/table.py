@@ -284,7 +284,8 @@ FIGURES: tuple[Figure, ...] = (
         "Sub-policies of every kind, and of other lengths of a regulariser (the number beside a point: t, or the mean "
         "stay of interleaved ones, in control steps). Right: fast straight on; low: safe when the direction is drawn "
         "anew every 50 control steps. Filled: Table 1's constant learning rate; white: annealed. Interquartile means "
-        "over seeds, bars 95 % intervals (of three seeds or fewer: their range).",
+        "over seeds, bars 95 % intervals (of three seeds or fewer: their range); a point without bars is one seed. The "
+        "filled point of interleaved ones: without annealing.",
         measures.safety_against_speed,
         measures.LENGTHS_AND_KINDS,
     ),

@@ -65,6 +65,14 @@ def study(tmp_path):
     return Study(tmp_path / "runs")
 
 
+@pytest.fixture
+def one_figure(monkeypatch):
+    """Reports have one figure only, one that is quickly drawn."""
+    (figure,) = find_figures(["4"])
+    monkeypatch.setattr(report, "FIGURES", (figure,))
+    return figure
+
+
 def fill(study, rows, seeds, **how):
     for row in rows:
         for seed in range(seeds):
@@ -340,7 +348,7 @@ def test_what_does_not_count_is_left_out_by_name(study):
         "seed-6/DONE is damaged or of another version of footwork: it does not say steps",
         "seed-7/DONE is of maze/flat/penalised seeds [7], the run was begun as maze/flat/free [7]",
         "seed-8/evaluation.json is of maze/flat/penalised, the run is of maze/flat/free",
-        "seed-9 is of another version of footwork (0.1.0): its seeds are []",
+        "seed-9/config.json is damaged: its seeds are []",
         "seed-10 is a file where a folder of runs was to be",
     ):
         assert any(words in problem for problem in found.problems), words
@@ -463,7 +471,7 @@ def test_folders_that_no_row_would_find_are_named(study):
 
 
 @pytest.mark.parametrize("inside", ["results", "results/full", "results/a/b"])
-def test_a_report_never_costs_the_runs_that_it_is_made_from(study, inside, tmp_path, capsys):
+def test_a_report_never_costs_the_runs_that_it_is_made_from(study, inside, tmp_path, capsys, one_figure):
     fill(study, ("walker/plain",), 2)
     (tmp_path / "out" / inside).parent.mkdir(parents=True)
     runs = study.runs.rename(tmp_path / "out" / inside)
@@ -475,9 +483,8 @@ def test_a_report_never_costs_the_runs_that_it_is_made_from(study, inside, tmp_p
     assert set(before) <= {path for path in runs.rglob("*") if path.is_file()}
 
 
-def test_a_report_replaces_what_a_report_wrote_and_nothing_else(study, tmp_path, capsys, monkeypatch):
+def test_a_report_replaces_what_a_report_wrote_and_nothing_else(study, tmp_path, capsys, one_figure):
     fill(study, ("walker/plain",), 2)
-    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
     to = tmp_path / "out"
     (to / "results").mkdir(parents=True)
     (to / "results" / "mine.txt").write_text("years of work")
@@ -497,11 +504,10 @@ def test_a_report_replaces_what_a_report_wrote_and_nothing_else(study, tmp_path,
         assert "the report's results lack it" in (to / "REPORT.md").read_text()
 
 
-def test_a_report_takes_away_older_figures_and_nobody_elses(study, tmp_path, monkeypatch):
+def test_a_report_takes_away_older_figures_and_nobody_elses(study, tmp_path, one_figure):
     fill(study, ("walker/plain",), 1)
-    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
     figures = tmp_path / "figures"
-    name = f"{FIGURES[0].name}.png"
+    name = f"{one_figure.name}.png"
     for folder in ("", "light", "mine", "mine/light"):
         (figures / folder).mkdir(parents=True, exist_ok=True)
         (figures / folder / name).write_text("before")
@@ -513,9 +519,8 @@ def test_a_report_takes_away_older_figures_and_nobody_elses(study, tmp_path, mon
     assert (figures / "mine" / name).read_text() == (figures / "mine/light" / name).read_text() == "before"
 
 
-def test_a_report_of_fewer_runs_never_replaces_one_of_more(study, tmp_path, capsys, monkeypatch):
+def test_a_report_of_fewer_runs_never_replaces_one_of_more(study, tmp_path, capsys, one_figure):
     fill(study, ("walker/plain",), 3)
-    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
     to = tmp_path / "out"
     assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 0
     few = Study(tmp_path / "few")
@@ -542,8 +547,7 @@ def test_a_report_of_fewer_runs_never_replaces_one_of_more(study, tmp_path, caps
     ).read_bytes()
 
 
-def test_studies_of_different_sizes_do_not_replace_each_other(study, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
+def test_studies_of_different_sizes_do_not_replace_each_other(study, tmp_path, capsys, one_figure):
     fill(study, ("walker/plain",), 1)
     assert run(["report", "--runs", str(study.runs), "--to", str(tmp_path / "out")]) == 0
     quick = Study(tmp_path / "quick", QUICK)
@@ -561,9 +565,8 @@ def test_studies_of_different_sizes_do_not_replace_each_other(study, tmp_path, c
     assert "file is a file, and a folder is wanted" in capsys.readouterr().err
 
 
-def test_results_that_a_killed_report_had_put_aside_come_back(study, tmp_path, monkeypatch):
+def test_results_that_a_killed_report_had_put_aside_come_back(study, tmp_path, one_figure):
     fill(study, ("walker/plain",), 2)
-    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
     to = tmp_path / "out"
     assert run(["report", "--runs", str(study.runs), "--to", str(to)]) == 0
     (to / "results").rename(to / ".results.old")  # as a kill between the two renames leaves it
@@ -990,7 +993,7 @@ def test_every_figure_is_drawn_where_there_is_nothing_yet(study, tmp_path):
 def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(study, tmp_path, monkeypatch):
     fill(study, (*WALKERS, "maze/flat/free"), 3)
     (study.runs / "walker/plain/seed-2/DONE").unlink()
-    monkeypatch.setattr(report, "FIGURES", [*FIGURES[:2], *find_figures(["7", "12"])])
+    monkeypatch.setattr(report, "FIGURES", find_figures(["4", "7", "12"]))
     found = results.Results(study)
     pages = report.write_report(found, tmp_path / "report", "footwork reproduce")
     text, page = (path.read_text() for path in pages)
@@ -1013,7 +1016,7 @@ def test_the_report_answers_the_paper_and_can_be_made_again_from_its_own_files(s
     assert any("seed-2 is not finished" in problem for problem in found.problems)
     assert text.index("## Claims") < text.index("## The paper") < text.index("## Figures")
     assert not re.search(r'(src|href)="(?!data:)', page)  # nothing but what is in the page itself
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 3
     assert all(f"| {claim.number} | {claim.words}" in text for claim in claims.CLAIMS)
     assert '<b class="undecided">undecided</b>' in page
     (eleven,) = (j.findings[0] for j in judging.judge_all(found) if j.claim.number == 11)
@@ -1163,7 +1166,7 @@ def test_lengths_of_a_regulariser_make_a_line_from_safe_to_fast(study):
     (ax, _) = measures.safety_against_speed(results.Results(study), measures.LENGTHS_AND_KINDS).axes
     lengths, annealed = (line for line in ax.lines if line.get_marker() != "None")
     assert [*lengths.get_ydata()] == pytest.approx([0.2, 0.4])
-    assert [text.get_text() for text in ax.texts] == ["25", "100", ""]
+    assert [text.get_text() for text in ax.texts] == ["25", "100"]
     assert [*annealed.get_ydata()] == pytest.approx([0.6])
     assert (lengths.get_mfc(), annealed.get_mfc()) == (lengths.get_color(), "white")
     assert lengths.get_color() == annealed.get_color()
@@ -1247,8 +1250,7 @@ def test_one_seed_has_no_interval(study):
     assert judging.show_effect(variance.findings[0]) == "-"
 
 
-def test_few_seeds_show_no_probability_and_versions_only_of_what_took_part(study, monkeypatch):
-    monkeypatch.setattr(report, "FIGURES", FIGURES[:1])
+def test_few_seeds_show_no_probability_and_versions_only_of_what_took_part(study, one_figure):
     fill(study, ("walker/plain", "walker/random-start"), 2)
     fill(study, ("bullet/walker/plain", "bullet/walker/random-start"), 1)
     for path in study.runs.rglob("config.json"):

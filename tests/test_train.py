@@ -272,6 +272,20 @@ def test_a_master_on_another_ant_stands_on_policies_of_that_ant(tmp_path):
     assert train_row(by_path, (0,), tmp_path, num_threads=1).source != trained.source
 
 
+def test_a_master_on_what_is_no_run_says_so_and_writes_nothing(tmp_path):
+    empty, file = tmp_path / "empty", tmp_path / "file.txt"
+    empty.mkdir()
+    file.touch()
+    for address, message in {
+        str(empty): "empty is a folder, but not of a run or an export",
+        str(file): "file.txt is a file, and a row's name or the folder of a run is wanted",
+        "walker/plan": "no run lies at 'walker/plan'; unknown row 'walker/plan'",
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            train_row(replace(tiny("bandit/hrl/plain"), sub_policies=address), (0,), tmp_path / "runs", num_threads=1)
+    assert not (tmp_path / "runs").exists()
+
+
 def test_an_unfinished_run_is_no_address(tmp_path):
     experiment = tiny("walker/plain")
     run = RunDir.create(tmp_path / "begun", {"experiment": config_to_json(experiment), "seeds": [0]})

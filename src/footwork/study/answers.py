@@ -20,6 +20,7 @@ from footwork.study.experiments import (
     INTERLEAVED_WITHOUT_MASTERS,
     MORE_REGULARISED_MASTERS,
     PAPER_MASTERS_VARIED,
+    grids_of,
     in_braces,
     is_row,
 )
@@ -89,7 +90,7 @@ def _varied(place: str) -> list[str]:
     return [row.name for row in PAPER_MASTERS_VARIED if f"/{place}/" in row.name]
 
 
-_LENGTHS = tuple(f"ablation/{kind}/t" for kind in PAPER_REGULARISERS)
+_LENGTHS = tuple(grid.name for grid in grids_of("t"))
 
 ANSWERS: tuple[Answer, ...] = (
     Answer(
@@ -192,8 +193,8 @@ ANSWERS: tuple[Answer, ...] = (
         "Random start, random repeated, appropriate bias: t timesteps (not stated)",
         figures=(14, 19, 22),
         shows=(
-            *_grid("handover", *_LENGTHS),
             *_grid("upside down", *_LENGTHS),
+            *_grid("speed", *_LENGTHS),
             *(
                 _rows(
                     "success",
@@ -442,7 +443,9 @@ def _side_by_side(shown: Shown, results: Results) -> str:
     for label, row in shown.rows:
         scores = results.scores(row, shown.metric) if is_row(row) else ()
         if len(scores):
-            measured.append(f"{label} {metric.show(float(iqm(scores)))} ({seeds_in_words(len(scores))})")
+            measured.append(
+                f"{label}{':' if grid else ''} {metric.show(float(iqm(scores)))} ({seeds_in_words(len(scores))})"
+            )
         else:
             missing.append((label, row))
     parts = [", ".join(measured)] if measured else []

@@ -245,6 +245,13 @@ FLAT_GRIDS: dict[str, str] = {
     "ablation/bandit/flat-penalised-bonus": "without an entropy bonus",
 }
 GRIDS_BY_NAME: dict[str, Grid] = {grid.name: grid for grid in GRIDS}
+
+
+def grids_of(what: str) -> tuple[Grid, ...]:
+    """The grids of one length, ``k`` of options or ``t`` of regularisers."""
+    return tuple(grid for grid in GRIDS if grid.name.rpartition("/")[2].partition("-")[0] == what)
+
+
 _ON_GRIDS = {row.name: row for grid in GRIDS for row in grid.rows()}
 
 # Annealing is one of the things that interleaved rows have besides their regulariser. The paper's rows with it.

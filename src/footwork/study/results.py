@@ -27,7 +27,6 @@ from footwork.study.runs import (
     experiment_of,
     how_to_reproduce,
     how_to_train_again,
-    of_another_version,
     same_row,
 )
 from footwork.study.training_curves import Curve, of_seed, read_curve
@@ -253,7 +252,7 @@ def _saved(run: RunDir) -> tuple[Experiment, list[int]]:
     experiment, seeds = experiment_of(run), run.config().get("seeds")
     run.versions()
     if not isinstance(seeds, list) or not seeds or any(type(seed) is not int for seed in seeds):
-        raise of_another_version(run, f"its seeds are {seeds!r}")
+        raise RunError(f"{run.path / 'config.json'} is damaged: its seeds are {seeds!r}")
     return experiment, list(seeds)
 
 

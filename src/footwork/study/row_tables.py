@@ -8,7 +8,7 @@ import numpy as np
 
 from footwork.evaluate import IDLE_SPEED
 from footwork.study.claims import MIN_SEEDS, Setting
-from footwork.study.experiments import ANNEALED, GRIDS, INTERLEAVED_WITHOUT, KINDS, find_row, is_row
+from footwork.study.experiments import ANNEALED, INTERLEAVED_WITHOUT, KINDS, find_row, grids_of, is_row
 from footwork.study.figures import count_in_words
 from footwork.study.metrics import METRICS, SWITCHED_EVERY
 from footwork.study.pages import TableBlock
@@ -37,7 +37,6 @@ _SETTINGS = {
     "AntMaze, the paper's": ("maze", "paper"),
 }
 _ANNEALED_KINDS = tuple(row.name.rpartition("/")[2] for row in ANNEALED)
-_LENGTHS = tuple(grid for grid in GRIDS if grid.name.endswith("/t"))  # of regularisers
 # A line's name, the row of its sub-policies, and those of its masters or flat policies: of any task and setting.
 _LINES: tuple[tuple[str, str, str], ...] = (
     *((kind, f"walker/{kind}", f"{{place}}/{{schedule}}/{kind}") for kind in KINDS),
@@ -59,7 +58,7 @@ _LINES: tuple[tuple[str, str, str], ...] = (
             f"{grid.name}/{value}",
             f"{grid.name.replace('ablation/', 'ablation/{place}/{schedule}-')}/{value}",
         )
-        for grid in _LENGTHS
+        for grid in grids_of("t")
         for value in grid.values
     ),
     *((f"flat policy, {kind}", "", f"{{place}}/flat/{{guided}}{kind}") for kind in ("free", "penalised")),
@@ -85,6 +84,12 @@ def side_by_side_caption(results: Results) -> str:
     """What the columns of :func:`side_by_side` are."""
     named = ("walker/plain", "walker/symmetric", "bandit/hrl/plain", "maze/hrl/plain", "maze/flat/free")
     rows = map(results.study.row, named)
+    own = ", ".join(
+        f"{grid.base.removeprefix('walker/')} {value}"
+        for grid in grids_of("t")
+        for value, row in grid.points().items()
+        if row == grid.base
+    )
     four, one, bandit, maze, flat = (count_in_words(row.total_steps * row.runs_per_seed) for row in rows)
     return (
         "Shares in per cent, interquartile means over seeds with 95 % intervals (one without width says only that the "
@@ -93,9 +98,9 @@ def side_by_side_caption(results: Results) -> str:
         f"{SWITCHED_EVERY}: switched at random every {SWITCHED_EVERY} control steps, options that gain less than "
         f"{IDLE_SPEED} m/s along their direction (idle), ants upside down in the end. The tasks: episodes in which a "
         "master on these sub-policies, or a flat policy, comes within 1 m of the goal (both settings); free: without "
-        "stability penalties. t, mean stay: another length of the regulariser than its kind has above. Control steps "
-        f"of training: four sub-policies {four} (those of appropriate bias stand on as many of plain ones), a "
-        f"symmetric one {one}, masters {bandit} on AntBandit and {maze} on AntMaze besides, "
+        "stability penalties. t, mean stay: another length of the regulariser (in control steps) than its kind has "
+        f"above ({own}). Control steps of training: four sub-policies {four} (those of appropriate bias stand on as "
+        f"many of plain ones), a symmetric one {one}, masters {bandit} on AntBandit and {maze} on AntMaze besides, "
         f"flat policies {flat}."
     )
 

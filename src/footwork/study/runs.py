@@ -184,7 +184,7 @@ def _find_or_train_needed(experiment: Experiment, runs: Path, num_threads: int) 
     if _run_at(experiment.needs) is not None:
         needed = find_trained(experiment.needs, runs)
     else:
-        row = with_robot(find_row(experiment.needs), experiment.task.robot)
+        row = with_robot(_row_at(experiment.needs), experiment.task.robot)
         found, reasons = _look_up(row, runs)
         instead = f"{row.name} is trained first" if found is None else f"{row.name} means {found.source}"
         _warn_of_passed_over(reasons, instead)
@@ -302,13 +302,8 @@ def experiment_of(run: RunDir) -> Experiment:
     except RunError:
         raise
     except ValueError as error:
-        raise of_another_version(run, str(error)) from None
-
-
-def of_another_version(run: RunDir, why: str) -> RunError:
-    """What is raised of a run whose config.json this version cannot make sense of."""
-    version = run.versions().get("footwork", "unknown")
-    return RunError(f"{run.path} is of another version of footwork ({version}): {why}")
+        version = run.versions().get("footwork", "unknown")
+        raise RunError(f"{run.path} is of another version of footwork ({version}): {error}") from None
 
 
 def passed_over(experiment: Experiment, runs: Path) -> tuple[list[str], list[str]]:
@@ -358,12 +353,7 @@ def find_trained(address: str, runs: Path) -> Trained:
     """
     run = _run_at(address)
     if run is None:
-        _refuse_other_places(address)
-        try:
-            row = find_row(address)
-        except ValueError as error:
-            raise ValueError(f"no run lies at {address!r}; {error}") from None
-        return _find(row, runs)
+        return _find(_row_at(address), runs)
     if not run.finished:
         name = experiment_of(run).name
         raise RunError(
@@ -387,11 +377,17 @@ def _run_at(address: str) -> RunDir | None:
     return None
 
 
-def _refuse_other_places(address: str) -> None:
-    """Say of a path that exists, and is no row's address, why it is no run: the table of rows would not help."""
+def _row_at(address: str) -> Experiment:
+    """The row of that address, or why it is none.
+
+    Of a path that exists, it says why no run is there: the table of rows would not help.
+    """
     path = Path(address)
     if is_row(address) or not path.exists():
-        return
+        try:
+            return find_row(address)
+        except ValueError as error:
+            raise ValueError(f"no run lies at {address!r}; {error}") from None
     if path.is_dir():
         raise ValueError(f"{address} is a folder, but not of a run or an export: it has no config.json")
     hint = f": name its folder, {path.parent}" if (path.parent / "config.json").is_file() else ""

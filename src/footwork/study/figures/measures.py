@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from footwork.study.experiments import (
     PAPER_MASTERS_VARIED,
     Grid,
     find_row,
+    grids_of,
 )
 from footwork.study.figures.style import (
     Look,
@@ -144,9 +145,7 @@ def grid_panels(results: Results, grids: tuple[Grid, ...], metrics: tuple[str, .
                 ax.set_title(grid.name.removeprefix("ablation/"))
             if metric == metrics[-1]:
                 ax.set_xlabel(f"{grid.words};\nbelow: seeds")
-        one = METRICS[metric]
-        words = one.words if one.is_share else f"{one.words} ({one.unit})"
-        line[0].set_ylabel(_wrapped(words, round(11 * height)))  # no longer than a panel is high
+        line[0].set_ylabel(_wrapped(_axis_words(metric), round(11 * height)))  # no longer than a panel is high
     return figure
 
 
@@ -158,6 +157,12 @@ def _limits(is_share: bool, effects: Sequence[Effect]) -> tuple[float, float]:
     return (min(low, 0.0) - margin if is_share or low < 0 else 0.0), high + margin
 
 
+def _axis_words(metric: str) -> str:
+    """What a metric is, with its unit unless it is a share."""
+    one = METRICS[metric]
+    return one.words if one.is_share else f"{one.words} ({one.unit})"
+
+
 def _wrapped(words: str, width: int = 26) -> str:
     lines = [""]
     for word in re.split(r"(?<!\d) ", words):  # a number stays with its unit
@@ -167,74 +172,87 @@ def _wrapped(words: str, width: int = 26) -> str:
 
 def rows_of_grids(what: str) -> tuple[str, ...]:
     """The points of the grids of one field, ``k`` or ``t``."""
-    return tuple(dict.fromkeys(row for grid in _grids(what) for row in grid.points().values()))
-
-
-def _grids(what: str) -> tuple[Grid, ...]:
-    return tuple(grid for grid in GRIDS if grid.name.rpartition("/")[2].partition("-")[0] == what)
+    return tuple(dict.fromkeys(row for grid in grids_of(what) for row in grid.points().values()))
 
 
 def k_grids(results: Results, rows: tuple[str, ...]) -> Any:
     """What the length k of an option does to a master."""
-    return grid_panels(results, _grids("k"), ("success", "way"), 2.4)
+    return grid_panels(results, grids_of("k"), ("success", "way"), 2.4)
 
 
 def t_grids(results: Results, rows: tuple[str, ...]) -> Any:
     """What the length t of each regulariser does to sub-policies."""
-    return grid_panels(results, _grids("t"), ("handover", "moving", "upside down", "speed"), 1.9)
+    return grid_panels(results, grids_of("t"), ("handover", "moving", "upside down", "speed"), 1.9)
 
 
-def _lines_of_kinds() -> tuple[tuple[str, dict[Any, str]], ...]:
-    """Rows of sub-policies by what stands beside them, in lines: lengths of a regulariser, and single rows."""
-    lengths = {grid.base: grid.points() for grid in _grids("t")}
-    own = (f"walker/{kind}" for kind in KINDS)
+class _Line(NamedTuple):
+    """Rows of sub-policies that belong together: the lengths of a regulariser, or one row (of length None)."""
+
+    name: str
+    look: Look
+    points: dict[Any, str]
+
+
+def _lines_of_kinds() -> tuple[_Line, ...]:
+    lengths = {grid.base: grid.points() for grid in grids_of("t")}
+    own = {kind: f"walker/{kind}" for kind in KINDS}
+    annealed = {row.name.rpartition("/")[2]: row.name for row in ANNEALED}
+    interleaved = look_of("interleaved")
     return (
-        *((row, lengths.get(row, {"": row})) for row in own),
-        *((row.name, {"": row.name}) for row in ANNEALED),
-        ("walker/interleaved", {"": UNANNEALED}),
+        *(_Line(kind, look_of(kind), lengths.get(row, {None: row})) for kind, row in own.items()),
+        *(_Line(kind, look_of(kind), {None: row}) for kind, row in annealed.items()),
+        *(
+            _Line(f"without {part}", interleaved._replace(mark=mark), {None: row.name})
+            for row, mark in zip(INTERLEAVED_WITHOUT, "dh*8", strict=True)
+            for part in (row.name.rpartition("/")[2].replace("-", " "),)
+        ),
     )
 
 
-UNANNEALED = "ablation/interleaved-without/annealing"
 # What :func:`safety_against_speed` reads.
 LENGTHS_AND_KINDS: tuple[str, ...] = tuple(
-    dict.fromkeys(row for _, points in _lines_of_kinds() for row in points.values())
+    dict.fromkeys(row for line in _lines_of_kinds() for row in line.points.values())
 )
 
 
 def safety_against_speed(results: Results, rows: tuple[str, ...]) -> Any:
     """Idle options and ants on their backs under random switching, against the speed straight on."""
-    prefix = next(row for row in rows if "walker/" in row).partition("walker/")[0]
-    figure, axes = panels(1, 2, 4.2)
+    prefix = _prefix_of(rows)
+    figure, axes = panels(1, 2, 4.4)
     for ax, metric in zip(axes[0], ("idle", "upside down"), strict=True):
-        for named, points in _lines_of_kinds():
-            there = [(value, prefix + row) for value, row in points.items() if prefix + row in rows]
-            found = [(value, row, results.middle(row, "speed"), results.middle(row, metric)) for value, row in there]
-            whole = [(value, row, x, y) for value, row, x, y in found if x is not None and y is not None]
+        for name, look, points in _lines_of_kinds():
+            there = [(length, prefix + row) for length, row in points.items() if prefix + row in rows]
+            found = [(length, row, results.middle(row, "speed"), results.middle(row, metric)) for length, row in there]
+            whole = [(length, row, x, y) for length, row, x, y in found if x is not None and y is not None]
             if not whole:
                 continue
-            look = look_of(named)
             face = look.colour if find_row(whole[0][1]).ppo.anneal_updates is None else "white"
-            for value, _, x, y in whole:
+            for _, _, x, y in whole:
                 ax.plot([x.low, x.high], [y.estimate] * 2, color=look.colour, lw=1.3, alpha=0.5)
                 ax.plot([x.estimate] * 2, [y.low, y.high], color=look.colour, lw=1.3, alpha=0.5)
-                at, look_like = (x.estimate, y.estimate), {"fontsize": 6.5, "color": look.colour}
-                ax.annotate(f"{value}", at, (4, 3), textcoords="offset points", **look_like)
+            for length, _, x, y in (whole[0], whole[-1]) if len(whole) > 1 else ():  # the others lie between, in order
+                at, style = (x.estimate, y.estimate), {"fontsize": 6.5, "color": look.colour}
+                ax.annotate(f"{length}", at, (4, 3), textcoords="offset points", **style)
             ax.plot(
                 [x.estimate for *_, x, _ in whole],
                 [y.estimate for *_, y in whole],
                 **{"color": look.colour, "marker": look.mark, "mfc": face, "ms": 5, "lw": 0.8},
-                label=named.rpartition("/")[2],
+                label=name,
             )
         if not ax.lines:
             empty(ax, "no finished runs yet")
             continue
-        ax.set_xlabel("speed along the direction (m/s)")
+        ax.set_xlabel(_axis_words("speed"))
         ax.set_ylabel(_wrapped(METRICS[metric].words, 44))
         ax.set_ylim(-0.02, max(ax.get_ylim()[1], 0.1))  # one ant is no tower
         ax.set_xlim(0, None)
     legend_below(figure, list(axes[0]), columns=4)
     return figure
+
+
+def _prefix_of(rows: tuple[str, ...]) -> str:
+    """The engine or ant of rows among which are sub-policies, as their addresses begin: ``light/``."""
+    return next(row for row in rows if "walker/" in row).partition("walker/")[0]
 
 
 def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
@@ -253,11 +271,11 @@ def comparisons(results: Results, rows: tuple[str, ...]) -> Any:
             ("handover", "moving", "speed"),
         ),
         (
-            "annealing, parts of interleaving, more regularisation, the ant: masters",
+            "annealing, more regularisation, parts of interleaving, the ant: masters",
             [
                 *_ANNEALED_MASTERS,
-                *_WITHOUT_MASTERS,
                 *_MORE_REGULARISED_MASTERS,
+                *_WITHOUT_MASTERS,
                 *(row for row in _OF_ANTS if not find_row(row).is_walker),
             ],
             ("way", "route", "success"),
@@ -344,12 +362,12 @@ def _dots(ax: Any, results: Results, metric: str, rows: list[str], named: bool) 
     ax.set_xlim(
         min(low, -0.03) if METRICS[metric].is_share else min(low, 0.0), 1.03 if METRICS[metric].is_share else high
     )
-    ax.set_xlabel(_wrapped(METRICS[metric].words, 28), fontsize=7)
+    ax.set_xlabel(_wrapped(_axis_words(metric), 28), fontsize=7)
 
 
 def masters_by_handovers(results: Results, rows: tuple[str, ...]) -> Any:
     """A point per seed: how well its sub-policies hand over, and how often the master on them arrives."""
-    prefix = next(row for row in rows if "walker/" in row).partition("walker/")[0]
+    prefix = _prefix_of(rows)
     there = [one for one in ASSOCIATIONS if any(row.startswith(f"{prefix}{one.place}/") for row in rows)]
     there = [one for one in there if seed_pairs(results, one, prefix)] or there
     figure, axes = panels(1, len(there), 3.0, share_y=True)

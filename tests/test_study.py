@@ -847,6 +847,15 @@ def test_masters_on_the_same_sub_policies_are_compared_seed_by_seed(study):
     again = next(f for f in found if f.contrast.words == "bandit, plain" and f.contrast.metric == "way")
     assert (again.effect, again.seeds) == (plain.effect, (10, 10))
     assert any("claim 13 compares bandit/paper/plain seed by seed" in problem for problem in held.problems)
+    for row, way in {"bandit/paper/interleaved": 0.8, "bandit/paper-penalised/interleaved": 0.9}.items():
+        exactly(fake_run(study, row, 0), way)
+    exactly(fake_run(study, "bandit/paper/interleaved", 1), 0.1)  # likewise, but nothing is decided on it
+    held = results.Results(study)
+    whole = next(j for j in judging.judge_all(held) if j.claim.number == 13 and j.setting.schedule == "paper")
+    shown = next(f for f in whole.findings if f.contrast.words == "bandit, interleaved")
+    assert (shown.contrast.decides, shown.seeds, shown.effect.estimate) == (False, (1, 1), pytest.approx(0.1))
+    assert whole.verdict == "undecided"  # AntMaze has no runs
+    assert not any("paper/interleaved" in problem for problem in held.problems)
 
 
 def test_a_verdict_rests_on_what_decided_and_names_what_is_missing(study):
@@ -1170,6 +1179,19 @@ def test_lengths_of_a_regulariser_make_a_line_from_safe_to_fast(study):
     assert [*annealed.get_ydata()] == pytest.approx([0.6])
     assert (lengths.get_mfc(), annealed.get_mfc()) == (lengths.get_color(), "white")
     assert lengths.get_color() == annealed.get_color()
+
+
+def test_masters_stand_beside_penalised_ones_on_the_same_sub_policies(study):
+    for row, way in {"bandit/hrl/interleaved": 0.9, "bandit/hrl-penalised/interleaved": 0.7}.items():
+        exactly(fake_run(study, row, 0), way)
+    exactly(fake_run(study, "bandit/hrl/interleaved", 1), 0.9)
+    axes = measures.masters_by_penalties(results.Results(study), measures.PENALISED_OR_NOT).axes
+    drawn = [ax for ax in axes if ax.lines]
+    assert [ax.get_xlabel().split()[0] for ax in drawn] == ["share", "episodes"]
+    free, penalised = (line for line in drawn[0].lines if line.get_marker() != "None")
+    assert [*free.get_xdata(), *penalised.get_xdata()] == pytest.approx([0.9, 0.7])
+    assert (free.get_mfc(), penalised.get_mfc()) == (free.get_color(), "white")
+    assert [label.get_text() for label in drawn[0].get_yticklabels()].count("(2 / 1)") == 1
 
 
 def test_masters_are_set_beside_their_own_sub_policies(study):

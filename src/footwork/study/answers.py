@@ -242,7 +242,7 @@ ANSWERS: tuple[Answer, ...] = (
         figures=(5, 6, 9, 10, 20),
         built="so here; verdicts rest on the distance too, success and the way around the walls stand beside it",
     ),
-    Answer("8", "Stability penalties while training the master do not make a difference", (13,), (20,)),
+    Answer("8", "Stability penalties while training the master do not make a difference", (13,), (20, 23)),
     Answer("8", "The regularised hierarchy outperforms the flat policies (Figures 5, 6)", (1, 2), (5, 6, 15, 18)),
     Answer(
         "8",

@@ -94,7 +94,7 @@ def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> F
     rows = tuple(setting.fill(row) for row in what.rows)
     by_seed = [results.scores_by_seed(row, what.metric) if is_row(row) else {} for row in rows]
     stands_on = [_stands_on(row) if what.paired and is_row(row) else row for row in rows]
-    by_seed = _in_pairs(results, claim, rows, stands_on, by_seed)
+    by_seed = _in_pairs(results, claim, what, rows, stands_on, by_seed)
     scores = [_as_array(score) for score in by_seed]
     seeds = tuple(map(len, scores))
     effect = _effect(results, claim, what, rows, stands_on, by_seed) if all(seeds) else None
@@ -154,17 +154,23 @@ def _stands_on(row: str) -> str:
 
 
 def _in_pairs(
-    results: Results, claim: Claim, rows: Sequence[str], stands_on: Sequence[str], by_seed: Sequence[dict[int, Any]]
+    results: Results,
+    claim: Claim,
+    what: Contrast,
+    rows: Sequence[str],
+    stands_on: Sequence[str],
+    by_seed: Sequence[dict[int, Any]],
 ) -> list[dict[int, Any]]:
-    """Of rows that stand on the same runs and have different seeds, those that all of them have; the others are named.
+    """Of rows that stand on the same runs and have different seeds, those that all of them have.
 
-    Where one has none at all there is nothing to compare, and nothing to say.
+    The others are named where the comparison decides. Where a row has none at all there is nothing to compare, and
+    nothing to say.
     """
     paired = []
     for row, base, scores in zip(rows, stands_on, by_seed, strict=True):
         partners = [other for other, b in zip(by_seed, stands_on, strict=True) if b == base and other]
         alone = sorted(seed for seed in scores if not all(seed in other for other in partners))
-        if alone:
+        if alone and what.decides:
             seeds = ", ".join(map(str, alone))
             said = (
                 f"claim {claim.number} compares {row} seed by seed, and leaves out those without a counterpart: {seeds}"

@@ -22,6 +22,7 @@ from footwork.study.experiments import (
     LIGHT_WITH_BONUS,
     MORE_REGULARISED_MASTERS,
     PAPER_MASTERS_VARIED,
+    SCHEDULES,
     Grid,
     find_row,
     grids_of,
@@ -385,6 +386,51 @@ def masters_by_handovers(results: Results, rows: tuple[str, ...]) -> Any:
     axes[0, 0].set_ylabel(_wrapped(METRICS[OF_MASTERS].words))
     legend_below(figure, list(axes[0]), columns=4)
     return figure
+
+
+# What :func:`masters_by_penalties` reads.
+PENALISED_OR_NOT: tuple[str, ...] = tuple(
+    f"{place}/{schedule}{penalised}/{kind}"
+    for place in ("bandit", "maze")
+    for schedule in SCHEDULES
+    for kind in KINDS
+    for penalised in ("", "-penalised")
+)
+
+
+def masters_by_penalties(results: Results, rows: tuple[str, ...]) -> Any:
+    """Masters trained with and without stability penalties, side by side on each kind of sub-policies."""
+    metrics = ("way", "success")
+    figure, axes = panels(2, len(SCHEDULES) * len(metrics), 2.4)
+    for line, place in zip(axes, ("bandit", "maze"), strict=True):
+        columns = [(schedule, metric) for schedule in SCHEDULES for metric in metrics]
+        for ax, (schedule, metric) in zip(line, columns, strict=True):
+            for y, kind in enumerate(KINDS):
+                for penalised, face, up in (("", None, -0.17), ("-penalised", "white", 0.17)):
+                    e = results.middle(f"{place}/{schedule}{penalised}/{kind}", metric)
+                    if e is None:
+                        continue
+                    look = look_of(kind)
+                    ax.plot([e.low, e.high], [y + up] * 2, color=look.colour, lw=1.3, alpha=0.5)
+                    ax.plot(e.estimate, y + up, marker=look.mark, color=look.colour, mfc=face or look.colour, ms=4)
+            seeds = [_without_and_with(results, f"{place}/{schedule}", kind) for kind in KINDS]
+            names = [
+                f"{kind} ({count})" if ax is line[0] else f"({count})" for kind, count in zip(KINDS, seeds, strict=True)
+            ]
+            ax.set_yticks(range(len(KINDS)), names if metric == metrics[0] else [""] * len(KINDS), fontsize=6.5)
+            ax.set_ylim(len(KINDS) - 0.5, -0.5)
+            ax.set_xlim(min(-0.05, ax.get_xlim()[0]), 1.05)
+            ax.set_xlabel(_wrapped(METRICS[metric].words, 22), fontsize=7)
+            if metric == metrics[0]:
+                ax.set_title(f"Ant{place.capitalize()}: {SCHEDULES[schedule]}", fontsize=8, loc="left")
+            if not ax.lines:
+                empty(ax, "no finished runs yet")
+    return figure
+
+
+def _without_and_with(results: Results, masters: str, kind: str) -> str:
+    """Numbers of seeds without and with penalties: ``10 / 3``."""
+    return " / ".join(str(len(results.samples(f"{masters}{penalised}/{kind}"))) for penalised in ("", "-penalised"))
 
 
 def profiles(results: Results, rows: tuple[str, ...]) -> Any:

@@ -1060,6 +1060,27 @@ def test_the_readme_shows_the_tables_of_the_report(monkeypatch):
         assert other not in changed  # the README shows the default ant's main rows, and verdicts without comparisons
 
 
+def test_the_documentation_shows_the_lengths_that_were_measured(study, monkeypatch):
+    root = Path(__file__).parents[1]
+    monkeypatch.syspath_prepend(str(root / "tools"))
+    import study_tables
+
+    page = (root / "docs/study.md").read_text(encoding="utf-8")
+    assert study_tables.with_lengths(page, results.Results(Study(root / "report/results"))) == page, (
+        "run tools/study_tables.py"
+    )
+    fill(study, ("walker/random-start",), 4)
+    fill(study, ("ablation/interleaved/t/16",), 1)
+    write_switching(study, "ablation/interleaved/t/16", 0, 0.25, 0.125)
+    changed = study_tables.with_lengths(page, results.Results(study)).splitlines()
+    start = next(i for i, line in enumerate(changed) if line.startswith(study_tables.HEAD)) + 2
+    assert changed[start].startswith("| random start | 50 | 4, their range | ")
+    assert " to " in changed[start]
+    assert changed[start + 1].startswith("| interleaved | 16 | 0 | ")
+    assert "| 25.0 | 12.5 | " in changed[start + 1]
+    assert not changed[start + 2].startswith("|")
+
+
 def write_switching(study, row, seed, idle, upside_down):
     """What random switching every 50 control steps showed of a fake run."""
     path = study.runs / row / f"seed-{seed}" / "transitions.json"

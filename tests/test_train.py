@@ -440,8 +440,14 @@ def test_the_command_says_what_a_run_stands_on_and_where_it_goes_on(tmp_path, ca
     assert "nothing to resume" not in said.err
     assert "takes" not in said.err
     place = next(tmp_path.glob("bandit/hrl/plain/custom-*"))
-    assert run(["evaluate", str(place), "--episodes", "1", "--threads", "1"]) == 0
+    evaluate = ["evaluate", str(place), "--episodes", "1", "--threads", "1"]
+    assert run(evaluate) == 0
     assert f"policies from {place / 'policy.safetensors'}" in capsys.readouterr().err
+    for asked, steps in {"": 4, "6": 6}.items():
+        assert run([*evaluate, "--json", *(["--episode-steps", asked] if asked else [])]) == 0
+        assert json.loads(capsys.readouterr().out)["episode_steps"] == steps
+    assert run([*evaluate, "--episode-steps", "0"]) == 1
+    assert "episode_steps must be >= 1, got 0" in capsys.readouterr().err
 
 
 def test_a_warning_of_ours_is_one_line_said_once_and_others_say_where_they_come_from(tmp_path, capsys):

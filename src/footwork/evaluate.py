@@ -214,6 +214,7 @@ def evaluate(
         "engine": experiment.engine,
         "seeds": list(trained.seeds),
         "episodes": int(closest.size),
+        "episode_steps": experiment.task.episode_steps,
         "success": None if success is None else {radius: float(hit.mean()) for radius, hit in success.items()},
         "fall_rate": float(fallen.mean()),
         "flip_rate": float(flipped.mean()),

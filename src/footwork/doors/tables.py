@@ -112,7 +112,8 @@ def evaluation_table(reports: list[dict[str, Any]]) -> Table:
     walkers = all(report["success"] is None for report in reports)
     table = Table(title="evaluation (95 % intervals in brackets)", title_justify="left")
     table.add_column("row", no_wrap=True)
-    table.add_column("episodes", justify="right")
+    for name in ("episodes", "of steps"):
+        table.add_column(name, justify="right")
     names = [f"m/s {name}" for name in DIRECTIONS] if walkers else [f"within {radius} m" for radius in SUCCESS_RADII]
     for name in (*names, "fall", "flip", "progress m", "time to goal s"):
         table.add_column(name, justify="right")
@@ -127,6 +128,7 @@ def evaluation_table(reports: list[dict[str, Any]]) -> Table:
         table.add_row(
             _played(report),
             str(report["episodes"]),
+            str(report["episode_steps"]),
             *cells,
             _rate(report["fall_rate"], interval["fall_rate"]),
             _rate(report["flip_rate"], interval["flip_rate"]),

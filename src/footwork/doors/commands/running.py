@@ -113,6 +113,7 @@ class Evaluate:
     runs: Path = Path("runs")  # where runs are kept; a row not found there comes from the package
     engine: str | None = None  # play on another physics than it was trained on: mujoco, mjx, bullet or bullet-original
     episodes: int = 1000  # per seed
+    episode_steps: int | None = None  # control steps to the end of an episode; default: as many as in its training
     seed: int = 1_000_003  # of the episodes
     deterministic: bool = False  # act by the mode of the distribution instead of a sample
     threads: int = 0  # of the physics; 0: all cores. Changes no number
@@ -126,7 +127,7 @@ class Evaluate:
 
         trained = find_trained(self.row, self.runs)
         needed = find_needed(trained, self.runs)
-        trained = _played_on(trained, self.engine)
+        trained = _played_on(trained, self.engine, self.episode_steps)
         say(which_policies(trained))
         _at_least_one("episodes", self.episodes)
         report = evaluate(trained, needed, self.episodes, self.seed, self.deterministic, self.threads)
@@ -215,14 +216,16 @@ class Export:
         return 0
 
 
-def _played_on(trained: Trained, engine: str | None) -> Trained:
-    """The same policies on another physics."""
+def _played_on(trained: Trained, engine: str | None, episode_steps: int | None = None) -> Trained:
+    """The same policies on another physics, in episodes of another length."""
     from dataclasses import replace
 
     from footwork.physics import require_engine
 
     experiment = trained.experiment if engine is None else replace(trained.experiment, engine=engine)
     require_engine(experiment.engine, experiment.task.robot)
+    if episode_steps is not None:
+        experiment = replace(experiment, task=replace(experiment.task, episode_steps=episode_steps))
     return trained._replace(experiment=experiment)
 
 

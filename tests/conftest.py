@@ -7,13 +7,15 @@ from pathlib import Path
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Tests share the cores by processes; a thread pool in each of them would only get in the way. Most of their time is
 # compilation: little of it is optimised, the emitters are the ones that compile fastest (a quarter less CPU time in
-# all), and none is done twice, not even by the processes that a test starts.
-FLAGS = (
-    "--xla_cpu_multi_thread_eigen=false",
-    "--xla_backend_optimization_level=0",
-    "--xla_cpu_use_fusion_emitters=false",
-    "--xla_cpu_parallel_codegen_split_count=1",
-)
+# all), and none is done twice, not even by the processes that a test starts. With FOOTWORK_SLOW=1 programs are compiled
+# as they are for users.
+FLAGS = ["--xla_cpu_multi_thread_eigen=false"]
+if os.environ.get("FOOTWORK_SLOW") != "1":
+    FLAGS += [
+        "--xla_backend_optimization_level=0",
+        "--xla_cpu_use_fusion_emitters=false",
+        "--xla_cpu_parallel_codegen_split_count=1",
+    ]
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS]).strip()
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

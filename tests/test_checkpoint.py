@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -209,46 +210,46 @@ def test_a_single_flipped_bit_in_any_byte_is_refused(tmp_path):
     assert checkpoint.load_arrays(path)[1] == META
 
 
-KILLER = """
-import os, signal, sys, time
+# A second save of the file is killed: by the kernel in the middle of writing, or by itself before or after a call.
+KILLED_AT = """
+import os, resource, signal, sys
 from pathlib import Path
 import numpy as np
 from footwork import checkpoint
 
-def save_for_ever(file, ready):
-    for step in range(10**9):
-        checkpoint.save(file, {"a": np.full(200_000, step)}, {"step": step})
-        if step == 1:
-            os.write(ready, b"x")
+file, moment, call = Path(sys.argv[1]), *sys.argv[2].split()
+save = lambda step: checkpoint.save(file, {"a": np.full(200_000, step)}, {"step": step})
+save(1)
+if call == "writing":
+    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, resource.RLIM_INFINITY))
+else:
+    whole = getattr(os, call)
 
-def kill_one(directory, seconds):
-    listen, ready = os.pipe()
-    child = os.fork()
-    if child == 0:
-        save_for_ever(directory / "c.safetensors", ready)
-    os.read(listen, 1)
-    time.sleep(seconds)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
+    def deadly(*arguments):
+        if moment == "after":
+            whole(*arguments)
+        os.kill(os.getpid(), signal.SIGKILL)
 
-root, wanted, most = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-for number in range(most):
-    kill_one(root / str(number), 0.003 * (number % 12))
-    if len(list(root.glob("*/.*.tmp"))) >= wanted:
-        break
+    setattr(os, call, deadly)
+save(2)
 """
 
 
-def test_kill_9_in_the_middle_of_writes_always_leaves_a_whole_checkpoint(tmp_path):
+@pytest.mark.parametrize(
+    ("moment", "step"),
+    {"while writing": 1, "before fsync": 1, "after fsync": 1, "before replace": 1, "after replace": 2}.items(),
+)
+def test_kill_9_at_any_moment_of_a_write_leaves_a_whole_checkpoint(tmp_path, moment, step):
+    file = tmp_path / "c.safetensors"
     environment = {"PYTHONPATH": os.pathsep.join(sys.path), "PATH": os.environ["PATH"]}
-    wanted, most = 3, 200  # a kill falls into a write by chance: as many as it takes, or this shows nothing
-    command = [sys.executable, "-c", KILLER, str(tmp_path), str(wanted), str(most)]
-    subprocess.run(command, env=environment, check=True, timeout=60)
-    for directory in tmp_path.iterdir():
-        arrays, meta = checkpoint.load_arrays(directory / "c.safetensors")
-        assert meta["step"] >= 1
-        np.testing.assert_array_equal(arrays["a"], np.full(200_000, meta["step"]))
-    assert len(list(tmp_path.glob("*/.*.tmp"))) == wanted
+    command = [sys.executable, "-c", KILLED_AT, str(file), moment]
+    killed_by = -subprocess.run(command, env=environment, timeout=60).returncode
+    assert killed_by == (signal.SIGXFSZ if moment == "while writing" else signal.SIGKILL)
+    assert len(list(tmp_path.glob(".*.tmp"))) == (2 - step)  # what was being written is never the file itself
+    arrays, meta = checkpoint.load_arrays(file)
+    assert meta["step"] == step
+    np.testing.assert_array_equal(arrays["a"], np.full(200_000, step))
 
 
 @contextlib.contextmanager

@@ -854,7 +854,10 @@ def test_masters_on_the_same_sub_policies_are_compared_seed_by_seed(study):
     whole = next(j for j in judging.judge_all(held) if j.claim.number == 13 and j.setting.schedule == "paper")
     shown = next(f for f in whole.findings if f.contrast.words == "bandit, interleaved")
     assert (shown.contrast.decides, shown.seeds, shown.effect.estimate) == (False, (1, 1), pytest.approx(0.1))
+    assert shown.probability == 1.0
     assert whole.verdict == "undecided"  # AntMaze has no runs
+    assert not any("random-start" in f.contrast.words for f in whole.findings)  # nor it, and nothing is decided on it
+    assert "bandit/paper-penalised/interleaved" not in claims.rows_read()  # so that it gets no more seeds for it
     assert not any("paper/interleaved" in problem for problem in held.problems)
 
 
@@ -950,6 +953,9 @@ def test_every_figure_can_be_drawn_of_another_ant_or_engine(study, tmp_path, pre
     names = {one.figure.name for one in drawn}
     assert {"11-handovers", "12-switching"} <= names
     assert "19-choices" not in names  # it sets one ant beside the other: there is one of it
+    (lengths,) = (one for one in drawn if one.figure.name == "22-safety-against-speed")
+    assert f"{prefix}walker/random-start" in lengths.without
+    assert not any("/t/" in row for row in lengths.without)  # that nobody planned there
     assert all(path.is_file() and path.parent.name == prefix.strip("/") for one in drawn for path in one.files)
 
 
@@ -1194,7 +1200,7 @@ def test_lengths_of_a_regulariser_make_a_line_from_safe_to_fast(study):
         write_switching(study, row, 0, idle, 0.1)
         write_switching(study, row, 1, idle, 0.1)
     (ax, _) = measures.safety_against_speed(results.Results(study), measures.LENGTHS_AND_KINDS).axes
-    lengths, annealed = (line for line in ax.lines if line.get_marker() != "None")
+    lengths, annealed = (line for line in ax.lines if line.get_marker() != "None" and len(line.get_xdata()))
     assert [*lengths.get_ydata()] == pytest.approx([0.2, 0.4])
     assert [text.get_text() for text in ax.texts] == ["25", "100"]
     assert [*annealed.get_ydata()] == pytest.approx([0.6])
@@ -1202,17 +1208,19 @@ def test_lengths_of_a_regulariser_make_a_line_from_safe_to_fast(study):
     assert lengths.get_color() == annealed.get_color()
 
 
-def test_masters_stand_beside_penalised_ones_on_the_same_sub_policies(study):
-    for row, way in {"bandit/hrl/interleaved": 0.9, "bandit/hrl-penalised/interleaved": 0.7}.items():
-        exactly(fake_run(study, row, 0), way)
-    exactly(fake_run(study, "bandit/hrl/interleaved", 1), 0.9)
-    axes = measures.masters_by_penalties(results.Results(study), measures.PENALISED_OR_NOT).axes
-    drawn = [ax for ax in axes if ax.lines]
+def test_what_penalties_cost_is_drawn_seed_by_seed(study):
+    for seed, way in enumerate((0.9, 0.5, 0.1)):
+        exactly(fake_run(study, "bandit/hrl/interleaved", seed), way)
+        if seed < 2:
+            exactly(fake_run(study, "bandit/hrl-penalised/interleaved", seed), way - 0.2)
+    found = results.Results(study)
+    axes = measures.cost_of_penalties(found, measures.PENALISED_OR_NOT).axes
+    drawn = [ax for ax in axes if any(line.get_marker() != "None" for line in ax.lines)]
     assert [ax.get_xlabel().split()[0] for ax in drawn] == ["share", "episodes"]
-    free, penalised = (line for line in drawn[0].lines if line.get_marker() != "None")
-    assert [*free.get_xdata(), *penalised.get_xdata()] == pytest.approx([0.9, 0.7])
-    assert (free.get_mfc(), penalised.get_mfc()) == (free.get_color(), "white")
-    assert [label.get_text() for label in drawn[0].get_yticklabels()].count("(2 / 1)") == 1
+    (cost,) = (line for line in drawn[0].lines if line.get_marker() != "None")
+    assert [*cost.get_xdata()] == pytest.approx([-20.0])  # the third seed has no counterpart
+    assert [label.get_text() for label in drawn[0].get_yticklabels()].count("(2)") == 1
+    assert sum("no finished runs" in text.get_text() for ax in axes for text in ax.texts) == len(axes) - 2
 
 
 def test_masters_are_set_beside_their_own_sub_policies(study):

@@ -453,7 +453,8 @@ def test_episodes_start_at_rest_around_the_start():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"episode_steps": 0}, "episode_steps must be >= 1, got 0"),
+        ({"episode_steps": 0}, r"episode_steps must be >= 1 and < 2\*\*31, got 0"),
+        ({"episode_steps": 2**31}, r"episode_steps must be >= 1 and < 2\*\*31, got 2147483648"),
         ({"fall_rule": "knee"}, "fall_rule must be height, flip, either or none, got 'knee'"),
         ({"potential": "magic"}, "potential must be straight or geodesic, got 'magic'"),
         ({"goal_radius": 0.0}, "goal_radius must be > 0, got 0.0"),

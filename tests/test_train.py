@@ -446,8 +446,9 @@ def test_the_command_says_what_a_run_stands_on_and_where_it_goes_on(tmp_path, ca
     for asked, steps in {"": 4, "6": 6}.items():
         assert run([*evaluate, "--json", *(["--episode-steps", asked] if asked else [])]) == 0
         assert json.loads(capsys.readouterr().out)["episode_steps"] == steps
-    assert run([*evaluate, "--episode-steps", "0"]) == 1
-    assert "episode_steps must be >= 1, got 0" in capsys.readouterr().err
+    for bad in ("0", "2147483648"):
+        assert run([*evaluate, "--episode-steps", bad]) == 1
+        assert f"episode_steps must be >= 1 and < 2**31, got {bad}" in capsys.readouterr().err
 
 
 def test_a_warning_of_ours_is_one_line_said_once_and_others_say_where_they_come_from(tmp_path, capsys):

@@ -18,9 +18,7 @@ MANY = 4  # seeds and more are a range
 
 def _switched(every: int, what: str) -> Callable[[Results, Sample], float]:
     def share(results: Results, sample: Sample) -> float:
-        entry = results.entry(sample, TRANSITIONS)
-        assert entry is not None, f"{sample.run.path} has no {TRANSITIONS}"
-        return float(entry["switching"][str(every)][what])
+        return float((results.entry(sample, TRANSITIONS) or {})["switching"][str(every)][what])
 
     return share
 
@@ -33,14 +31,15 @@ def lines_of(results: Results, grid: Grid) -> list[str]:
     kind = grid.base.removeprefix("walker/").replace("-", " ")
     lines = []
     for value, row in grid.points().items():
-        samples = results.samples(row)
+        samples = [sample for sample in results.samples(row) if results.entry(sample, TRANSITIONS) is not None]
         if not samples:
             continue
         seeds = [sample.seed for sample in samples]
         which = f"{len(seeds)}, their range" if len(seeds) >= MANY else ", ".join(map(str, seeds))
+        speeds, handovers = (results.scores_by_seed(row, metric) for metric in ("speed", "handover"))
         cells = [
-            _listed([f"{speed:.2f}" for speed in results.scores(row, "speed")]),
-            _listed([f"{100 * share:.1f}" for share in results.scores(row, "handover")]),
+            _listed([f"{speeds[seed]:.2f}" for seed in seeds]),
+            _listed([f"{100 * handovers[seed]:.1f}" for seed in seeds]),
             *(_listed([f"{100 * share(results, sample):.1f}" for sample in samples]) for share in SWITCHED),
         ]
         lines.append(f"| {' | '.join([kind, str(value), which, *cells])} |\n")

@@ -9,7 +9,7 @@ from footwork.checkpoint import check_writable
 from footwork.doors import tables
 from footwork.physics import require_engine
 from footwork.record import RunError
-from footwork.study.experiments import is_row, match_rows
+from footwork.study.experiments import in_braces, is_row, match_rows
 from footwork.study.figures import draw_figures, find_figures
 from footwork.study.job import completed
 from footwork.study.judging import judge_all
@@ -70,7 +70,7 @@ def figures(names: tuple[str, ...], runs: Path, to: Path, under: str, any_length
     if not every:
         raise RunError(f"no finished runs under {under!r} of which there are figures in {runs}")
     for drawn in every:
-        lacks = f"; no finished runs of {', '.join(drawn.without)}" if drawn.without else ""
+        lacks = f"; no finished runs of {in_braces(drawn.without)}" if drawn.without else ""
         _say(f"wrote {drawn.files[0]} and {drawn.files[1].name}{lacks}")
     _say_problems(results)
     return 0

@@ -110,10 +110,11 @@ def claims_table(judgements: list[Judgement], size: str) -> Table:
 def evaluation_table(reports: list[dict[str, Any]]) -> Table:
     """Rows side by side, rates in per cent with their 95 % intervals."""
     walkers = all(report["success"] is None for report in reports)
-    table = Table(title="evaluation (95 % intervals in brackets)", title_justify="left")
+    lengths = " or ".join(str(steps) for steps in sorted({report["episode_steps"] for report in reports}))
+    title = f"evaluation, episodes of {lengths} control steps (95 % intervals in brackets)"
+    table = Table(title=title, title_justify="left")
     table.add_column("row", no_wrap=True)
-    for name in ("episodes", "of steps"):
-        table.add_column(name, justify="right")
+    table.add_column("episodes", justify="right")
     names = [f"m/s {name}" for name in DIRECTIONS] if walkers else [f"within {radius} m" for radius in SUCCESS_RADII]
     for name in (*names, "fall", "flip", "progress m", "time to goal s"):
         table.add_column(name, justify="right")
@@ -128,7 +129,6 @@ def evaluation_table(reports: list[dict[str, Any]]) -> Table:
         table.add_row(
             _played(report),
             str(report["episodes"]),
-            str(report["episode_steps"]),
             *cells,
             _rate(report["fall_rate"], interval["fall_rate"]),
             _rate(report["flip_rate"], interval["flip_rate"]),

@@ -1,4 +1,4 @@
-"""The paper's claims and ours, written down before the runs: rows of data, and the rules that decide them.
+"""The paper's claims and ours: rows of data, and the rules that decide them, written down before the runs.
 
 A claim compares rows of the table in a metric (:data:`footwork.study.metrics.METRICS`).
 Each comparison is a contrast of interquartile means over seeds with a 95 % stratified-bootstrap
@@ -14,6 +14,8 @@ rule            holds                      does not hold
 ``at least``    L >= threshold             U < threshold
 ``at most``     U <= threshold             L > threshold
 ==============  =========================  ================================
+
+Comparisons that do not decide are shown; some were added later (:attr:`Contrast.afterwards`).
 
 Anything else is undecided, and so is every comparison with fewer than :attr:`Claim.min_seeds`
 seeds on a side. A claim holds if all its deciding comparisons hold; it does not hold if one does not.
@@ -49,6 +51,7 @@ class Contrast:
         bound: the smallest difference that matters, or the threshold of ``at least`` and ``at most``.
         statistic: of each row's scores: the IQM, or the spread across seeds.
         decides: otherwise it is only shown.
+        afterwards: shown, and first looked at after the claim's verdict; its rows get no more seeds for it.
         paired: rows that stand on the same sub-policies are compared seed by seed: their seeds are drawn together.
     """
 
@@ -60,6 +63,7 @@ class Contrast:
     bound: float
     statistic: Literal["iqm", "spread"] = "iqm"
     decides: bool = True
+    afterwards: bool = False
     paired: bool = False
 
 
@@ -391,8 +395,10 @@ CLAIMS: tuple[Claim, ...] = (
         (
             *_shown_too(_both(lambda place: _penalties(place, _PENALISED_KINDS))),
             *(
-                replace(c, decides=False)
-                for c in _both(lambda place: _penalties(place, [k for k in KINDS if k not in _PENALISED_KINDS]))
+                replace(c, decides=False, afterwards=True)
+                for c in _shown_too(
+                    _both(lambda place: _penalties(place, (kind for kind in KINDS if kind not in _PENALISED_KINDS)))
+                )
             ),
         ),
     ),
@@ -487,6 +493,7 @@ def rows_read(prefixes: Iterable[str] = ("",)) -> list[str]:
         for claim in CLAIMS
         for setting in settings_of(claim, everything)
         for c in claim.contrasts
+        if not c.afterwards
         for row in c.rows
     }
     order = {name: i for i, name in enumerate(MAIN)}

@@ -249,7 +249,8 @@ GRIDS_BY_NAME: dict[str, Grid] = {grid.name: grid for grid in GRIDS}
 
 def grids_of(what: str) -> tuple[Grid, ...]:
     """The grids of one length, ``k`` of options or ``t`` of regularisers."""
-    return tuple(grid for grid in GRIDS if grid.name.rpartition("/")[2].partition("-")[0] == what)
+    field = {"k": "option_steps", "t": "regulariser."}[what]
+    return tuple(grid for grid in GRIDS if grid.field.startswith(field))
 
 
 _ON_GRIDS = {row.name: row for grid in GRIDS for row in grid.rows()}

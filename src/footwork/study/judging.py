@@ -78,7 +78,8 @@ def _has_masters(results: Results, claim: Claim, setting: Setting) -> bool:
 def judge(results: Results, claim: Claim, setting: Setting) -> Judgement:
     """A claim's verdict in a setting, from the files of its runs."""
     contrasts = [c for c in claim.contrasts if c.decides or all(is_row(setting.fill(row)) for row in c.rows)]
-    findings = tuple(_find(results, claim, c, setting) for c in contrasts)
+    found = [_find(results, claim, c, setting) for c in contrasts]
+    findings = tuple(f for f in found if not f.contrast.afterwards or any(f.seeds))
     deciding = [finding for finding in findings if finding.contrast.decides]
     verdict, so_far = _overall([f.verdict for f in deciding]), _overall([f.so_far for f in deciding])
     return Judgement(claim, setting, _where(claim, setting), findings, verdict, so_far, _why(claim, deciding, verdict))
@@ -183,6 +184,9 @@ def _in_pairs(
 def _probability(what: Contrast, scores: list[Floats]) -> float | None:
     if len(scores) != 2:
         return None
+    if what.paired:  # that a seed does better than its counterpart
+        one, other = map(as_scores, scores)
+        return float(np.mean((one > other) + 0.5 * (one == other)))
     if what.statistic == "spread":  # that a run is farther from the middle of its row
         if min(map(len, scores)) < 3:  # a lone one is its own middle
             return None

@@ -111,7 +111,8 @@ def _reading() -> tuple[str, ...]:
     return (
         "An effect is a difference of interquartile means over seeds with its 95 % stratified-bootstrap interval, "
         "whole seeds drawn within each row; differences of shares are in percentage points. P is the probability that "
-        "a run of the first row scores higher than one of the second.",
+        "a run of the first row scores higher than one of the second (compared seed by seed: the share of seeds that "
+        "do).",
         "Rules, margins and the number of seeds asked for stood in footwork/study/claims.py before the study's runs, "
         "after pilots of one to three seeds of the same kinds. By these the stay of interleaved rows was chosen, for "
         "random switching, which is shown at claim 14; no t of the paper's kinds was. A difference that was to be at "

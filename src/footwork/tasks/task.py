@@ -54,8 +54,8 @@ class Task:
     xy_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.episode_steps < 1:
-            raise ValueError(f"episode_steps must be >= 1, got {self.episode_steps}")
+        if not 1 <= self.episode_steps < 2**31:  # it is counted in 32 bits
+            raise ValueError(f"episode_steps must be >= 1 and < 2**31, got {self.episode_steps}")
         if self.fall_rule not in ("height", "flip", "either", "none"):
             raise ValueError(f"fall_rule must be height, flip, either or none, got {self.fall_rule!r}")
         if self.potential not in ("straight", "geodesic"):

@@ -11,6 +11,7 @@ import numpy as np
 from footwork.arena import DIRECTIONS
 from footwork.statistics import Effect, Floats, contrast, generator_for, iqm, profile_band
 from footwork.study.association import ASSOCIATIONS, OF_MASTERS, OF_SUB_POLICIES, seed_pairs, strength
+from footwork.study.claims import CLAIMS, Setting
 from footwork.study.experiments import (
     ANNEALED,
     ANNEALED_MASTERS,
@@ -37,6 +38,7 @@ from footwork.study.figures.style import (
     panels,
     seeds_of,
 )
+from footwork.study.judging import Finding, judge
 from footwork.study.measure import TRANSITIONS
 from footwork.study.metrics import METRICS
 from footwork.study.results import Results, seeds_in_words
@@ -203,9 +205,12 @@ def _lines_of_kinds() -> tuple[_Line, ...]:
         *(_Line(kind, look_of(kind), lengths.get(row, {None: row})) for kind, row in own.items()),
         *(_Line(kind, look_of(kind), {None: row}) for kind, row in annealed.items()),
         *(
-            _Line(f"without {part}", interleaved._replace(mark=mark), {None: row.name})
-            for row, mark in zip(INTERLEAVED_WITHOUT, "dh*8", strict=True)
-            for part in (row.name.rpartition("/")[2].replace("-", " "),)
+            _Line(
+                f"without {row.name.rpartition('/')[2].replace('-', ' ')}",
+                interleaved._replace(mark=mark),
+                {None: row.name},
+            )
+            for row, mark in zip(INTERLEAVED_WITHOUT, "dP*s", strict=True)
         ),
     )
 
@@ -231,7 +236,9 @@ def safety_against_speed(results: Results, rows: tuple[str, ...]) -> Any:
             for _, _, x, y in whole:
                 ax.plot([x.low, x.high], [y.estimate] * 2, color=look.colour, lw=1.3, alpha=0.5)
                 ax.plot([x.estimate] * 2, [y.low, y.high], color=look.colour, lw=1.3, alpha=0.5)
-            for length, _, x, y in (whole[0], whole[-1]) if len(whole) > 1 else ():  # the others lie between, in order
+            for length, _, x, y in dict.fromkeys((whole[0], whole[-1])):  # the others lie between, in order
+                if length is None:
+                    continue
                 at, style = (x.estimate, y.estimate), {"fontsize": 6.5, "color": look.colour}
                 ax.annotate(f"{length}", at, (4, 3), textcoords="offset points", **style)
             ax.plot(
@@ -247,6 +254,7 @@ def safety_against_speed(results: Results, rows: tuple[str, ...]) -> Any:
         ax.set_ylabel(_wrapped(METRICS[metric].words, 44))
         ax.set_ylim(-0.02, max(ax.get_ylim()[1], 0.1))  # one ant is no tower
         ax.set_xlim(0, None)
+    axes[0, 0].plot([], [], ls="", marker="o", color="#444444", mfc="white", ms=5, label="(white: annealed)")
     legend_below(figure, list(axes[0]), columns=4)
     return figure
 
@@ -388,7 +396,7 @@ def masters_by_handovers(results: Results, rows: tuple[str, ...]) -> Any:
     return figure
 
 
-# What :func:`masters_by_penalties` reads.
+# What :func:`cost_of_penalties` reads.
 PENALISED_OR_NOT: tuple[str, ...] = tuple(
     f"{place}/{schedule}{penalised}/{kind}"
     for place in ("bandit", "maze")
@@ -396,41 +404,46 @@ PENALISED_OR_NOT: tuple[str, ...] = tuple(
     for kind in KINDS
     for penalised in ("", "-penalised")
 )
+_PENALTIES = next(claim for claim in CLAIMS if claim.number == 13)
 
 
-def masters_by_penalties(results: Results, rows: tuple[str, ...]) -> Any:
-    """Masters trained with and without stability penalties, side by side on each kind of sub-policies."""
+def cost_of_penalties(results: Results, rows: tuple[str, ...]) -> Any:
+    """What penalties in a master's reward change, seed by seed on the same sub-policies, on each kind of them."""
     metrics = ("way", "success")
-    figure, axes = panels(2, len(SCHEDULES) * len(metrics), 2.4)
+    figure, axes = panels(2, len(SCHEDULES) * len(metrics), 2.3)
+    found = {schedule: judge(results, _PENALTIES, Setting("", schedule)).findings for schedule in SCHEDULES}
     for line, place in zip(axes, ("bandit", "maze"), strict=True):
         columns = [(schedule, metric) for schedule in SCHEDULES for metric in metrics]
         for ax, (schedule, metric) in zip(line, columns, strict=True):
-            for y, kind in enumerate(KINDS):
-                for penalised, face, up in (("", None, -0.17), ("-penalised", "white", 0.17)):
-                    e = results.middle(f"{place}/{schedule}{penalised}/{kind}", metric)
-                    if e is None:
-                        continue
-                    look = look_of(kind)
-                    ax.plot([e.low, e.high], [y + up] * 2, color=look.colour, lw=1.3, alpha=0.5)
-                    ax.plot(e.estimate, y + up, marker=look.mark, color=look.colour, mfc=face or look.colour, ms=4)
-            seeds = [_without_and_with(results, f"{place}/{schedule}", kind) for kind in KINDS]
-            names = [
-                f"{kind} ({count})" if ax is line[0] else f"({count})" for kind, count in zip(KINDS, seeds, strict=True)
-            ]
-            ax.set_yticks(range(len(KINDS)), names if metric == metrics[0] else [""] * len(KINDS), fontsize=6.5)
-            ax.set_ylim(len(KINDS) - 0.5, -0.5)
-            ax.set_xlim(min(-0.05, ax.get_xlim()[0]), 1.05)
-            ax.set_xlabel(_wrapped(METRICS[metric].words, 22), fontsize=7)
+            there = {
+                f.rows[1].rpartition("/")[2]: f
+                for f in found[schedule]
+                if f.contrast.metric == metric and f.rows[1].startswith(f"{place}/") and f.effect is not None
+            }
+            _differences(ax, there, line[0] is ax, metric == metrics[0])
+            ax.set_xlabel(_wrapped(f"{METRICS[metric].words} (points)", 22), fontsize=7)
             if metric == metrics[0]:
                 ax.set_title(f"Ant{place.capitalize()}: {SCHEDULES[schedule]}", fontsize=8, loc="left")
-            if not ax.lines:
-                empty(ax, "no finished runs yet")
     return figure
 
 
-def _without_and_with(results: Results, masters: str, kind: str) -> str:
-    """Numbers of seeds without and with penalties: ``10 / 3``."""
-    return " / ".join(str(len(results.samples(f"{masters}{penalised}/{kind}"))) for penalised in ("", "-penalised"))
+def _differences(ax: Any, there: dict[str, Finding], named: bool, counted: bool) -> None:
+    """A line per kind of sub-policies: a difference in points with its interval; left of it the kind, and its seeds."""
+    for y, kind in enumerate(KINDS):
+        if kind in there and (e := there[kind].effect) is not None:
+            look = look_of(kind)
+            ax.plot([100 * e.low, 100 * e.high], [y, y], color=look.colour, lw=1.3, alpha=0.5)
+            ax.plot(100 * e.estimate, y, marker=look.mark, color=look.colour, ms=4.5)
+    seeds = [f"({there[kind].seeds[0] if kind in there else 0})" for kind in KINDS]
+    names = [f"{kind} {count}" if named else count for kind, count in zip(KINDS, seeds, strict=True)]
+    ax.set_yticks(range(len(KINDS)), names if counted else [""] * len(KINDS), fontsize=6.5)
+    ax.set_ylim(len(KINDS) - 0.5, -0.5)
+    if ax.lines:
+        low, high = ax.get_xlim()
+        ax.set_xlim(min(low, -10.0), max(high, 10.0))  # a tenth of a point is no cost
+    else:
+        empty(ax, "no finished runs yet")
+    ax.axvline(0.0, color="#444444", lw=0.8, zorder=0)
 
 
 def profiles(results: Results, rows: tuple[str, ...]) -> Any:

@@ -308,7 +308,7 @@ def test_seeds_that_trained_side_by_side_count_as_they_would_alone(study):
         if sample.seed:  # at twice the rate, each takes half of what it would alone
             np.testing.assert_allclose(other.seconds[-1], curves[1][1].seconds[-1] / 2, rtol=1e-2)
     assert together.training_seconds(row)[0] == seconds[0]
-    assert not together.problems
+    assert not together.said()
     made = "\n".join(str(block) for block in report._made(together, [row], "footwork report"))
     train, reproduce = made.index("footwork train maze/flat/free --seeds 3 4 5  #"), made.index("footwork reproduce")
     assert train < reproduce
@@ -630,15 +630,18 @@ def test_masters_that_vary_a_field_differ_from_the_papers_in_nothing_else():
 
 
 def test_mixed_runs_are_named(study):
-    paths = [fake_run(study, "maze/flat/free", seed) for seed in range(2)]
-    config = json.loads((paths[0] / "config.json").read_text())
-    config["versions"] |= {"mujoco": "3.3.0", "device": "NVIDIA H200"}
-    write(paths[0] / "config.json", config)
+    for row in ("maze/flat/penalised", "maze/flat/free"):
+        paths = [fake_run(study, row, seed) for seed in range(2)]
+        config = json.loads((paths[0] / "config.json").read_text())
+        config["versions"] |= {"mujoco": "3.3.0", "device": "NVIDIA H200"}
+        write(paths[0] / "config.json", config)
     shutil.copy(paths[0] / "evaluation.json", paths[1])
     found = results.Results(study)
     assert len(found.scores("maze/flat/free", "way")) == 1
-    assert any("different versions of mujoco: 3.3.0, " in problem for problem in found.problems)
-    assert any("on different devices: NVIDIA H200, the CPU" in problem for problem in found.problems)
+    found.samples("maze/flat/penalised")
+    rows = "runs of maze/flat/{free,penalised} were made"  # one line for both
+    assert sum(f"{rows} with different versions of mujoco: 3.3.0, " in line for line in found.said()) == 1
+    assert f"{rows} on different devices: NVIDIA H200, the CPU" in found.said()
     assert any("evaluation.json is of seeds [0], the run has [1]: delete" in problem for problem in found.problems)
 
 

@@ -99,8 +99,8 @@ def _results(runs: Path, any_length: bool) -> Results:
 
 
 def _say_problems(results: Results) -> None:
-    for problem in results.problems:
-        _say(problem)
+    for line in results.said():
+        _say(line)
 
 
 def _say(line: str) -> None:

@@ -321,9 +321,7 @@ def _left_out(results: Results, judgements: Sequence[Judgement], drawn: Sequence
             by_count.setdefault(f"{have} of {planned[row]}", []).append(row)
         said = "; ".join(f"{count}: {in_braces(group)}" for count, group in by_count.items())
         blocks.append(Text(f"Rows with fewer seeds than the study plans or a claim asks for: {said}."))
-    problems = [
-        problem for problem in results.problems if problem not in results.unfinished
-    ]  # those are rows with fewer
+    problems = [line for line in results.said() if line not in results.unfinished]  # those are rows with fewer
     if problems:
         here = f"{results.study.runs}{os.sep}"
         there = f" --runs {results.study.runs}"  # where the report was made says nothing to who reads it elsewhere

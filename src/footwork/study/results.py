@@ -2,7 +2,7 @@
 
 A run counts as a row if its saved config is the row's, and its length too. Whatever is
 left out (unfinished, another config or length, a damaged or missing file, a seed that
-is there twice) is named in :attr:`Results.problems`; nothing is skipped in silence.
+is there twice) is named by :meth:`Results.said`; nothing is skipped in silence.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from footwork.physics import libraries_of
 from footwork.record import RunDir, RunError, device_in
 from footwork.statistics import Effect, Floats, contrast, generator_for
-from footwork.study.experiments import EXPERIMENTS, MAIN, is_row
+from footwork.study.experiments import EXPERIMENTS, MAIN, in_braces, is_row
 from footwork.study.measure import EVALUATION, problem_with
 from footwork.study.metrics import METRICS
 from footwork.study.plan import Study
@@ -75,6 +75,7 @@ class Results:
     any_length: bool = False
     problems: dict[str, None] = field(default_factory=dict)  # an ordered set
     unfinished: set[str] = field(default_factory=set)  # those of them that are only runs that are not done yet
+    mixed: dict[str, list[str]] = field(default_factory=dict)  # rows whose runs are of more than one make, by which
     _samples: dict[str, tuple[Sample, ...]] = field(default_factory=dict)
     _curves: dict[Path, Curve] = field(default_factory=dict)
     _files: dict[tuple[Path, str], list[dict[str, Any]]] = field(default_factory=dict)
@@ -88,9 +89,15 @@ class Results:
         if row not in self._samples:
             found, left_out = find_samples(self.study, row, self.any_length)
             self._samples[row] = found
-            self.problems.update(dict.fromkeys([*(run.why for run in left_out), *_mixed_versions(row, found)]))
+            self.problems.update(dict.fromkeys(run.why for run in left_out))
+            for makes in _makes(found):
+                self.mixed.setdefault(makes, []).append(row)
             self.unfinished.update(run.why for run in left_out if run.unfinished)
         return self._samples[row]
+
+    def said(self) -> list[str]:
+        """What is to be said of the files that were read: problems, and which rows are of more than one make."""
+        return [*self.problems, *(f"runs of {in_braces(rows)} were made {makes}" for makes, rows in self.mixed.items())]
 
     def curves(self, row: str) -> list[tuple[Sample, Curve]]:
         """The training curves of a row's seeds."""
@@ -229,18 +236,18 @@ def _dangling(study: Study, place: Path, files: list[str]) -> list[Path]:
     return sorted(path for path, row in rows.items() if is_row(row.as_posix()) or is_row(row.parent.as_posix()))
 
 
-def _mixed_versions(row: str, samples: tuple[Sample, ...]) -> list[str]:
+def _makes(samples: tuple[Sample, ...]) -> list[str]:
     """Runs of one row that other code, libraries or devices made count all the same; it is said."""
-    problems = []
+    makes = []
     engines = {sample.experiment.engine for sample in samples}
     for library in ("footwork", "source", *dict.fromkeys(name for engine in engines for name in libraries_of(engine))):
         found = sorted({str(sample.run.versions().get(library, "unknown")) for sample in samples})
         if len(found) > 1:
-            problems.append(f"runs of {row} were made with different versions of {library}: {', '.join(found)}")
+            makes.append(f"with different versions of {library}: {', '.join(found)}")
     devices = sorted({device_in(sample.run.versions()) for sample in samples})
     if len(devices) > 1:
-        problems.append(f"runs of {row} were made on different devices: {', '.join(devices)}")
-    return problems
+        makes.append(f"on different devices: {', '.join(devices)}")
+    return makes
 
 
 def _saved(run: RunDir) -> tuple[Experiment, list[int]]:

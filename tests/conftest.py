@@ -6,7 +6,7 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Tests share the cores by processes; a thread pool in each of them would only get in the way. Most of their time is
-# compilation: little of it is optimised, the emitters are the ones that compile fastest (a quarter less CPU time in
+# compilation: little of it is optimised, the emitters are the ones that compile fastest (a fifth less CPU time in
 # all), and none is done twice, not even by the processes that a test starts. With FOOTWORK_SLOW=1 programs are compiled
 # as they are for users.
 FLAGS = ["--xla_cpu_multi_thread_eigen=false"]

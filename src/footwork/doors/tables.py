@@ -1,12 +1,14 @@
-"""Tables for a terminal, plain where there is none."""
+"""Tables for a terminal of any width, plain where there is none."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
+from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.measure import Measurement
+from rich.table import Column, Table
 
 from footwork.arena import DIRECTIONS
 from footwork.physics import DEFAULT_ENGINE, ENGINES
@@ -16,22 +18,56 @@ from footwork.study.plan import Job
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment
 
+# What a narrow terminal does without, the first of these first.
+LEFT_OUT_FIRST = ("S", "needs", "task", "trains", "k", "peak MB", "compiling s", "to first update s")
+
 
 def show(*tables: Table) -> None:
-    """Print tables to standard output; a pipe gets all columns, uncut."""
+    """Print tables to standard output: a pipe gets all columns, a narrow terminal those that fit, no cell cut."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=200)
     for table in tables:
+        fit(table, console)
         console.print(table)
+
+
+def fit(table: Table, console: Console) -> None:
+    """Make a table fit the width of a console: fewer lines between its cells, then fewer columns, which are named."""
+    if _least_width(table, console) > console.width:
+        table.box, table.pad_edge, table.show_edge = box.SIMPLE_HEAD, False, False
+    left_out = []
+    for header in LEFT_OUT_FIRST:
+        if _least_width(table, console) <= console.width:
+            break
+        if any(column.header == header for column in table.columns):
+            table.columns = [column for column in table.columns if column.header != header]
+            left_out.append(header)
+    if left_out:
+        table.caption = f"for want of width without: {', '.join(left_out)}"
+        table.caption_justify = "left"
+
+
+def _least_width(table: Table, console: Console) -> int:
+    """Characters that a table takes if its columns are as narrow as they may be: whole cells, or words."""
+    unbound = console.options.update(width=100_000)
+
+    def spare(column: Column) -> int:
+        if column.no_wrap:
+            return 0
+        sizes = [Measurement.get(console, unbound, text) for text in (column.header, *column.cells)]
+        return max(size.maximum for size in sizes) - max(size.minimum for size in sizes)
+
+    return Measurement.get(console, unbound, table).maximum - sum(spare(column) for column in table.columns)
 
 
 def rows_table(experiments: list[Experiment], found: dict[str, str], every_row: bool = False) -> Table:
     """What each row trains, on what, and whether trained policies are at hand; variations in short."""
     title = "rows" if every_row else "rows (variations in short: --all shows them)"
     table = Table(title=title, title_justify="left")
-    for column in ("row", "trains", "task", "needs", "S", "k", "control steps", "trained"):
-        table.add_column(column, justify="right" if column in ("S", "k", "control steps") else "left", no_wrap=True)
+    for column in ("row", "trains", "task", "needs", "S", "k", "control\nsteps", "trained"):
+        justify: Literal["left", "right"] = "right" if column in ("S", "k", "control\nsteps") else "left"
+        table.add_column(column, justify=justify, no_wrap=column not in ("row", "trained"), overflow="fold")
     groups: dict[str, list[Experiment]] = {}
     for row in experiments:
         groups.setdefault(group_of(row.name), []).append(row)
@@ -72,7 +108,7 @@ def _row_cells(row: Experiment, name: str, found: str) -> tuple[str, ...]:
     """One line of the table of rows."""
     kind = "master" if row.is_master else "sub-policies" if row.is_walker else "flat policy"
     k = str(row.option_steps) if row.is_master else ""
-    steps = f"{row.total_steps:,}" + (" x 4" if row.runs_per_seed > 1 else "")
+    steps = f"{row.total_steps / 1e6:g} M" + (" x 4" if row.runs_per_seed > 1 else "")
     return name, kind, row.task.name, row.needs or "", str(row.ppo.batch_size), k, steps, found
 
 
@@ -88,12 +124,13 @@ def plan_table(taken: dict[Job, int], done: set[Job], size: str) -> Table:
     left = total - sum(taken.values())
     title = f"{size} study: {len(jobs)} runs, {total:,} control steps\n{len(done)} runs done, {left:,} steps to do"
     table = Table(title=title, title_justify="left")
-    for column in ("row", "seeds", "done", "control steps"):
-        table.add_column(column, justify="left" if column == "row" else "right", no_wrap=True)
+    for column in ("row", "seeds\ndone", "control\nsteps"):
+        is_name = column == "row"
+        table.add_column(column, justify="left" if is_name else "right", no_wrap=not is_name, overflow="fold")
     for row in dict.fromkeys(job.row for job in jobs):
         mine = [job for job in jobs if job.row == row]
         there = sum(job in done for job in mine)
-        table.add_row(row, str(len(mine)), str(there), f"{sum(job.steps for job in mine):,}")
+        table.add_row(row, f"{there} of {len(mine)}", f"{sum(job.steps for job in mine):,}")
     return table
 
 
@@ -108,34 +145,39 @@ def claims_table(judgements: list[Judgement], size: str) -> Table:
 
 
 def evaluation_table(reports: list[dict[str, Any]]) -> Table:
-    """Rows side by side, rates in per cent with their 95 % intervals."""
+    """Rows side by side, a line per figure: rates in per cent with their 95 % intervals."""
     walkers = all(report["success"] is None for report in reports)
     lengths = " or ".join(str(steps) for steps in sorted({report["episode_steps"] for report in reports}))
-    title = f"evaluation, episodes of {lengths} control steps (95 % intervals in brackets)"
+    title = f"evaluation, episodes of {lengths} control steps\n95 % intervals in brackets"
     table = Table(title=title, title_justify="left")
-    table.add_column("row", no_wrap=True)
-    table.add_column("episodes", justify="right")
-    names = [f"m/s {name}" for name in DIRECTIONS] if walkers else [f"within {radius} m" for radius in SUCCESS_RADII]
-    for name in (*names, "fall", "flip", "progress m", "time to goal s"):
-        table.add_column(name, justify="right")
+    table.add_column("", no_wrap=True)
     for report in reports:
-        interval = report["interval"]
-        if walkers:
-            cells = [f"{sum(speeds) / len(speeds):.2f}" for speeds in report["speed_mps"].values()]
-        elif report["success"] is None:
-            cells = ["-" for _ in SUCCESS_RADII]
-        else:
-            cells = [_rate(report["success"][r], interval["success"][r]) for r in report["success"]]
-        table.add_row(
-            _played(report),
-            str(report["episodes"]),
-            *cells,
-            _rate(report["fall_rate"], interval["fall_rate"]),
-            _rate(report["flip_rate"], interval["flip_rate"]),
-            f"{report['progress_m']:.2f}",
-            "-" if report["time_to_goal_s"] is None else f"{report['time_to_goal_s']:.1f}",
-        )
+        table.add_column(_played(report), justify="right", overflow="fold")
+    within = [f"within {radius} m, %" for radius in SUCCESS_RADII]
+    speeds = [f"{name}, m/s" for name in DIRECTIONS]
+    names = ["episodes", *(speeds if walkers else within), "fall, %", "flip, %", "progress, m", "time to goal, s"]
+    for name, *cells in zip(names, *(_evaluation_cells(report, walkers) for report in reports), strict=True):
+        table.add_row(name, *cells)
     return table
+
+
+def _evaluation_cells(report: dict[str, Any], walkers: bool) -> list[str]:
+    """A row's figures, from top to bottom."""
+    interval = report["interval"]
+    if walkers:
+        cells = [f"{sum(speeds) / len(speeds):.2f}" for speeds in report["speed_mps"].values()]
+    elif report["success"] is None:
+        cells = ["-" for _ in SUCCESS_RADII]
+    else:
+        cells = [_rate(report["success"][r], interval["success"][r]) for r in report["success"]]
+    return [
+        str(report["episodes"]),
+        *cells,
+        _rate(report["fall_rate"], interval["fall_rate"]),
+        _rate(report["flip_rate"], interval["flip_rate"]),
+        f"{report['progress_m']:.2f}",
+        "-" if report["time_to_goal_s"] is None else f"{report['time_to_goal_s']:.1f}",
+    ]
 
 
 def handover_table(report: dict[str, Any]) -> Table:
@@ -143,23 +185,23 @@ def handover_table(report: dict[str, Any]) -> Table:
     table = Table(title=f"{_played(report)}: hand-over, m/s after (fall %, flip %)", title_justify="left")
     table.add_column("from \\ to")
     for name in DIRECTIONS:
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     for name, row in zip(DIRECTIONS, report["handover"], strict=True):
         cells = (f"{c['speed_mps']:.2f} ({100 * c['fall']:.0f}, {100 * c['flip']:.0f})" for c in row)
         table.add_row(name, *cells)
     return table
 
 
-def switching_table(reports: list[dict[str, Any]]) -> Table:
-    """Random switching, one line per row and period."""
-    how = " between orthogonal directions" if any(report["orthogonal"] for report in reports) else ""
-    table = Table(title=f"random switching{how} for 2000 control steps", title_justify="left")
-    for column in ("row", "k", "m/s per option", "idle %", "upside down %", "fallen %"):
-        table.add_column(column, justify="left" if column == "row" else "right", no_wrap=True)
-    for report in reports:
-        for k, figures in report["switching"].items():
-            shares = (f"{100 * figures[name]:.1f}" for name in ("idle", "upside_down", "fallen"))
-            table.add_row(_played(report), k, f"{figures['speed_mps']:.2f}", *shares)
+def switching_table(report: dict[str, Any]) -> Table:
+    """Random switching, one line per period."""
+    how = " between orthogonal directions" if report["orthogonal"] else ""
+    title = f"{_played(report)}:\nrandom switching{how} for 2000 control steps"
+    table = Table(title=title, title_justify="left")
+    for column in ("k", "m/s per option", "idle %", "upside down %", "fallen %"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for k, figures in report["switching"].items():
+        shares = (f"{100 * figures[name]:.1f}" for name in ("idle", "upside_down", "fallen"))
+        table.add_row(k, f"{figures['speed_mps']:.2f}", *shares)
     return table
 
 
@@ -181,9 +223,9 @@ def bench_tables(report: dict[str, Any]) -> list[Table]:
 
 def _contestants_table(contestants: dict[str, Any], note: str) -> Table:
     table = Table(title=f"control steps per second, median (least, largest)\n{note}", title_justify="left")
-    table.add_column("contestant", no_wrap=True)
+    table.add_column("contestant", overflow="fold")
     for name in ("steps/s", "decisions/s", "over its physics", "to first update s", "compiling s", "peak MB"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", overflow="fold")
     for name, record in contestants.items():
         if "skipped" in record:
             table.add_row(name, escape(f"skipped: {record['skipped']}"))

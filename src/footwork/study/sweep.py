@@ -440,20 +440,23 @@ def _display(board: Board, log: Callable[[str], None]) -> Iterator[Display]:
 
 
 def board_table(board: Board) -> Any:
-    """Rows with something to do or to report: seeds done, how far the running ones are."""
+    """Rows with something to do or to report: seeds done, how far the running ones are; fits 80 characters."""
+    from rich import box
     from rich.table import Table
 
-    table = Table(title=board.line(), title_justify="left", caption_justify="left")
-    for column in ("row", "seeds done", "running", "failed"):
-        table.add_column(column, justify="left" if column == "row" else "right", no_wrap=True)
+    table = Table(title=board.line(), title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    table.add_column("row", overflow="fold")
+    for column in ("seeds\ndone", "running", "failed") if board.failed else ("seeds\ndone", "running"):
+        table.add_column(column, justify="right", no_wrap=True)
     for row in dict.fromkeys(job.row for job in board.jobs):
         jobs = [job for job in board.jobs if job.row == row]
         running = [job for job in jobs if job in board.active]
         failed = sum(job in board.failed for job in jobs)
         if running or failed:
-            shares = ", ".join(f"seed {job.seed}: {steps_of(board.study, job) / job.steps:.0%}" for job in running)
+            shares = (f"seed {job.seed}: {steps_of(board.study, job) / job.steps:4.0%}" for job in running)
             done = sum(job in board.done for job in jobs)
-            table.add_row(row, f"{done} / {len(jobs)}", shares, str(failed) if failed else "")
+            cells = (f"{done} of {len(jobs)}", "\n".join(shares), str(failed) if failed else "")
+            table.add_row(row, *cells[: len(table.columns) - 1])
     return table
 
 

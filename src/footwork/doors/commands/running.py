@@ -173,7 +173,7 @@ class Transitions:
         if self.json:
             print(json.dumps(report))
         else:
-            tables.show(tables.handover_table(report), tables.switching_table([report]))
+            tables.show(tables.handover_table(report), tables.switching_table(report))
         return 0
 
 

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -453,6 +454,25 @@ def test_progress_on_a_terminal_stays_on_one_line(clock):
             progress.update(step, {"speed": 2.0})
     assert stream.getvalue().count("\n") == 1
     assert "1,000/1,000  100%" in stream.getvalue()
+
+
+def test_progress_on_a_narrow_terminal_goes_on_below_and_cuts_nothing(clock, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("COLUMNS", "60")
+    stream = Terminal()
+    with Progress(2_000_000, "maze/hrl/symmetric-interleaved", stream) as progress:
+        clock.now += 0.3
+        progress.update(1_000_000, {"success": 0.5, "episode progress m": 12.5})
+    shown = stream.getvalue()
+    assert "…" not in shown
+    last = [line for line in re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown).replace("\r", "\n").splitlines() if line][-3:]
+    assert max(map(len, last)) <= 60
+    assert last[0].startswith("maze/hrl/symmetric-interleaved  1,000,000/2,000,000")
+    assert "success 0.5" in last[1]
+    assert last[2].strip() == "episode progress m 12.5"
 
 
 def test_progress_that_was_never_updated_says_nothing():

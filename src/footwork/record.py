@@ -40,7 +40,7 @@ import types
 import typing
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -476,14 +476,14 @@ class Progress:
         self._interval = 0.25 if self._stream.isatty() else 5.0  # s
         self._recent = deque([(time.monotonic(), initial_step)], maxlen=32)
         self._shown_at = time.monotonic()
-        self._waiting = ""  # the newest line, while it has not been shown
+        self._waiting: list[str] = []  # the newest line's parts, while it has not been shown
         self._live: Any = None
 
     def update(self, step: int, figures: Mapping[str, float]) -> None:
         """Say that ``step`` is reached, and the figures that matter."""
         now = time.monotonic()
         self._recent.append((now, step))
-        self._waiting = self._line(step, figures)
+        self._waiting = self._parts(step, figures)
         if now - self._shown_at >= self._interval:
             self._show()
             self._shown_at = now
@@ -507,22 +507,22 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _line(self, step: int, figures: Mapping[str, float]) -> str:
+    def _parts(self, step: int, figures: Mapping[str, float]) -> list[str]:
         (then, first), (now, _) = self._recent[0], self._recent[-1]
         rate = (step - first) / max(now - then, 1e-9)
         parts = [self._label, f"{step:,}/{self._total_steps:,}", f"{step / max(self._total_steps, 1):.0%}"]
         parts.append(f"{rate:,.0f} steps/s")
         if rate > 0:
             parts.append(f"{timedelta(seconds=round(max(self._total_steps - step, 0) / rate))} left")
-        return "  ".join(parts + [f"{name} {value:.4g}" for name, value in figures.items()])
+        return parts + [f"{name} {value:.4g}" for name, value in figures.items()]
 
     def _show(self) -> None:
         if self._stream.isatty():
             self._show_live()
         else:
-            self._stream.write(self._waiting + "\n")
+            self._stream.write("  ".join(self._waiting) + "\n")
             self._stream.flush()
-        self._waiting = ""
+        self._waiting = []
 
     def _show_live(self) -> None:
         from rich.console import Console  # only a terminal needs it
@@ -532,7 +532,19 @@ class Progress:
         if self._live is None:
             self._live = Live(console=Console(file=self._stream), auto_refresh=False)
             self._live.start()
-        self._live.update(Text(self._waiting, no_wrap=True, overflow="ellipsis"), refresh=True)
+        lines = _folded(self._waiting, self._live.console.width)
+        self._live.update(Text(lines, no_wrap=True, overflow="ellipsis"), refresh=True)
+
+
+def _folded(parts: Sequence[str], width: int) -> str:
+    """Parts side by side, in as many lines as a terminal's width asks for."""
+    lines = [parts[0]]
+    for part in parts[1:]:
+        if len(lines[-1]) + 2 + len(part) <= width:
+            lines[-1] += f"  {part}"
+        else:
+            lines.append(f"  {part}")
+    return "\n".join(lines)
 
 
 def _take(descriptor: int, path: Path) -> None:

@@ -19,7 +19,7 @@ from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment
 
 # What a narrow terminal does without, the first of these first.
-LEFT_OUT_FIRST = ("S", "needs", "task", "trains", "k", "peak MB", "compiling s", "to first update s")
+LEFT_OUT_FIRST = ("S", "needs", "task", "trains", "k", "peak MB", "compiling s", "to first\nupdate s", "decisions/s")
 
 
 def show(*tables: Table) -> None:
@@ -44,7 +44,8 @@ def fit(table: Table, console: Console) -> None:
             table.columns = [column for column in table.columns if column.header != header]
             left_out.append(header)
     if left_out:
-        table.caption = f"for want of width without: {', '.join(left_out)}"
+        names = ", ".join(header.replace("\n", " ") for header in left_out)
+        table.caption = f"for want of width without: {names}"
         table.caption_justify = "left"
 
 
@@ -224,11 +225,11 @@ def bench_tables(report: dict[str, Any]) -> list[Table]:
 def _contestants_table(contestants: dict[str, Any], note: str) -> Table:
     table = Table(title=f"control steps per second, median (least, largest)\n{note}", title_justify="left")
     table.add_column("contestant", overflow="fold")
-    for name in ("steps/s", "decisions/s", "over its physics", "to first update s", "compiling s", "peak MB"):
-        table.add_column(name, justify="right", overflow="fold")
+    for name in ("steps/s", "decisions/s", "over its\nphysics", "to first\nupdate s", "compiling s", "peak MB"):
+        table.add_column(name, justify="right", no_wrap=True)
     for name, record in contestants.items():
         if "skipped" in record:
-            table.add_row(name, escape(f"skipped: {record['skipped']}"))
+            table.add_row(escape(f"{name}: skipped: {record['skipped']}"))
             continue
         rates = (_spread(record.get(key), form) for key, form in CONTESTANT_FIGURES)
         table.add_row(name, *rates, *(_number(record.get(key)) for key in ("start_s", "compile_s", "peak_mb")))
@@ -240,8 +241,9 @@ CONTESTANT_FIGURES = (("steps_per_second", ",.0f"), ("decisions_per_second", ",.
 
 def _targets_table(report: dict[str, Any]) -> Table:
     table = Table(title="ratios, within each round", title_justify="left")
-    for name in ("figure", "median (least, largest)", "asked for", "reached"):
-        table.add_column(name, justify="left" if name == "figure" else "right", no_wrap=True)
+    for name in ("figure", "median\n(least, largest)", "asked\nfor", "reached"):
+        is_name = name == "figure"
+        table.add_column(name, justify="left" if is_name else "right", no_wrap=not is_name, overflow="fold")
     figures = {**{key: report[key] for key in report["targets"]}, "compile_s": report["compile_s"]}
     for key in {**figures, "peak_mb": 0, **report["ratios"]}:
         if report.get(key) is None:
@@ -254,11 +256,12 @@ def _targets_table(report: dict[str, Any]) -> Table:
 
 def _growth_table(axis: str, points: list[dict[str, Any]]) -> Table:
     table = Table(title=f"how cost grows with {axis}", title_justify="left")
-    for name in (axis, "steps/s", "over physics alone", "to first update s", "compiling s", "peak MB"):
-        table.add_column(name, justify="right")
+    table.add_column(axis, overflow="fold")
+    for name in ("steps/s", "over\nphysics alone", "to first\nupdate s", "compiling s", "peak MB"):
+        table.add_column(name, justify="right", no_wrap=True)
     for point in points:
         if "skipped" in point:
-            table.add_row(str(point["size"]), escape(f"skipped: {point['skipped']}"))
+            table.add_row(escape(f"{point['size']}: skipped: {point['skipped']}"))
             continue
         rates = (_spread(point["steps_per_second"], ",.0f"), _spread(point["over_reference"], ".2f"))
         table.add_row(

@@ -892,7 +892,7 @@ def test_where_all_stand_at_the_wall_it_is_said_that_nothing_more_was_possible(s
             end_at(study.runs / f"maze/paper/{kind}/seed-{seed}", (-4.0, -2.3))
             exactly(study.runs / f"maze/paper/{kind}/seed-{seed}", way)
     why = verdicts(study, 8)["mujoco, heavy ant, the paper's reward and schedule"].why
-    assert "plain, about 2.9 points were possible up to the wall, and nobody ended beyond it" in why
+    assert "plain, about 2.9 points were possible up to the wall, and nobody ended a metre nearer than that" in why
     end_at(study.runs / "maze/paper/plain/seed-3", study.row("maze/paper/plain").task.arena.goals[0])  # somebody did
     assert "possible" not in verdicts(study, 8)["mujoco, heavy ant, the paper's reward and schedule"].why
 

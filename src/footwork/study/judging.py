@@ -39,7 +39,7 @@ class Finding:
     verdict: Verdict
     so_far: Verdict  # what the rule says if the number of seeds is not asked for
     room: float | None = None  # the most that a difference of shares could be: what the other row leaves
-    at_wall: bool = False  # room ends where the straight line meets a wall: nobody on either side ended beyond it
+    at_wall: bool = False  # room ends where the straight line meets a wall: nobody on either side ended nearer
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def no_room(finding: Finding) -> str:
         return ""
     if finding.at_wall:
         points = 100 * max(finding.room, 0.0)
-        return f"about {points:.1f} points were possible up to the wall, and nobody ended beyond it"
+        return f"about {points:.1f} points were possible up to the wall, and nobody ended a metre nearer than that"
     return f"no more than {100 * finding.room:.1f} points were possible"
 
 

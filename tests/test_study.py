@@ -1309,7 +1309,11 @@ def test_few_seeds_show_no_probability_and_versions_only_of_what_took_part(study
     fill(study, ("bullet/walker/plain", "bullet/walker/random-start"), 1)
     for path in study.runs.rglob("config.json"):
         config = json.loads(path.read_text())
-        config["versions"] |= {"pybullet": "3.2.7"}
+        config["versions"] |= {"pybullet": "3.2.7", "commit": "abc1234"}
+        if path.parent.name == "seed-1" and "random-start" in str(path):
+            config["versions"]["commit"] = "def5678"
+        if "bullet" in path.parts:
+            del config["versions"]["commit"]
         write(path, config)
     found = results.Results(study)
     judgements = judging.judge_all(found)
@@ -1318,6 +1322,10 @@ def test_few_seeds_show_no_probability_and_versions_only_of_what_took_part(study
     assert all(judging.show_chance(finding) is None for finding in compared)
     said = report.write_report(found, study.runs.parent / "out", "footwork report")[0].read_text()
     assert "| pybullet | 3.2.7 | 2 |" in said  # not the runs on MuJoCo
+    commits = said[said.index("Which runs were made at which commit") :].splitlines()[2:7]
+    assert commits[2] == "| abc1234 | 3 | walker/plain; walker/random-start (seed 0) |"
+    assert commits[4] == "| def5678 | 1 | walker/random-start (seed 1) |"
+    assert commits[3].startswith("| not recorded | 2 | bullet/walker/{plain,random-start}")
     assert re.search(r"\* bullet: undecided, too few seeds: (\d+, )*12(, \d+)*; runs missing: \d+", said)
     assert re.search(r"1 of 10: [^;]*bullet/walker/{plain,random-start}", said)
     for row in ("walker/plain", "walker/random-start"):

@@ -342,7 +342,7 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
             steps += sample.control_steps
             theirs = set(libraries_of(sample.experiment.engine))
             for name, version in sample.run.versions().items():
-                if name in engines - theirs:  # was there, and had no part in it
+                if name == "commit" or name in engines - theirs:  # told below; was there, and had no part in it
                     continue
                 found[name, str(version)] = found.get((name, str(version)), 0) + 1
         seconds += sum(results.training_seconds(row))
@@ -371,7 +371,29 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
             f"source {source_digest()}. Where something has two versions here, not all runs are of one make."
         ),
         TableBlock(("version of", "is", "runs"), versions),
+        Text("Which runs were made at which commit, with all seeds of a row where none are named:"),
+        _commits_table(results, rows),
     ]
+
+
+def _commits_table(results: Results, rows: Sequence[str]) -> TableBlock:
+    """The commit of each run, most runs first."""
+    made: dict[str, dict[str, list[int]]] = {}
+    for row in rows:
+        for sample in results.samples(row):
+            commit = str(sample.run.versions().get("commit", "not recorded"))
+            made.setdefault(commit, {}).setdefault(row, []).append(sample.seed)
+    lines = []
+    for commit, theirs in made.items():
+        groups: dict[str, list[str]] = {}
+        for row, seeds in theirs.items():
+            whole = len(seeds) == len(results.samples(row))
+            name = f" (seed{'s' * (len(seeds) > 1)} {', '.join(map(str, sorted(seeds)))})"
+            groups.setdefault("" if whole else name, []).append(row)
+        count = sum(map(len, theirs.values()))
+        lines.append((count, commit, "; ".join(f"{in_braces(group)}{seeds}" for seeds, group in groups.items())))
+    table = ((commit, str(count), said) for count, commit, said in sorted(lines, key=lambda line: -line[0]))
+    return TableBlock(("commit", "runs", "rows"), tuple(table))
 
 
 def _trained_together(results: Results, row: str) -> list[list[int]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import io
 import json
 import os
 import subprocess
@@ -16,7 +15,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 
 from footwork.doors import cli, tables
 from footwork.learn import ppo
@@ -132,19 +130,9 @@ def test_whoever_is_missing_is_skipped_by_name_in_the_table(fake, capsys):
     _, report, _ = fake()
     tables.show(*tables.bench_tables(report))
     lines = [line for line in capsys.readouterr().out.splitlines() if "sbx Ant-v5, 1 env" in line]
-    assert len(lines) == 1
-    assert "skipped: sbx is not installed" in lines[0]
-
-
-def test_its_tables_fit_80_characters_uncut(fake):
-    _, report, _ = fake(learning=True)
-    console = Console(width=80, file=io.StringIO())
-    for table in tables.bench_tables(report):
-        tables.fit(table, console)
-        console.print(table)
-    shown = console.file.getvalue()
-    assert "…" not in shown
-    assert max(map(len, shown.splitlines())) <= 80
+    assert len(lines) == 2
+    assert "skipped" in lines[0]
+    assert "skipped: sbx is not installed" in lines[1]  # below the table
 
 
 def test_ctrl_c_keeps_what_was_measured(fake):

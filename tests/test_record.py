@@ -475,6 +475,13 @@ def test_progress_on_a_narrow_terminal_goes_on_below_and_cuts_nothing(clock, mon
     assert last[2].strip() == "episode progress m 12.5"
 
 
+@pytest.mark.parametrize(("width", "lines"), [(19, 1), (18, 2), (10, 3), (5, 3)])
+def test_parts_go_on_below_only_where_they_do_not_fit(width, lines):
+    folded = record._folded(["walker", "100%", "m/s 2"], width)  # 6 + 2 + 4 + 2 + 5 characters
+    assert folded.split() == ["walker", "100%", "m/s", "2"]
+    assert folded.count("\n") == lines - 1
+
+
 def test_progress_that_was_never_updated_says_nothing():
     stream = io.StringIO()
     Progress(10, "x", stream).close()

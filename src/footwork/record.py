@@ -467,7 +467,7 @@ _GIT_PLACES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
 class Progress:
-    """One line that says how far a run is: live on a terminal, elsewhere a plain line every few seconds."""
+    """How far a run is: live on a terminal, in lines as narrow as that is; elsewhere a plain line every few seconds."""
 
     def __init__(self, total_steps: int, label: str, stream: TextIO | None = None, initial_step: int = 0) -> None:
         self._total_steps = total_steps

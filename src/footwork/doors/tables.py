@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
-from rich.measure import Measurement
-from rich.table import Column, Table
+from rich.table import Table
 
 from footwork.arena import DIRECTIONS
 from footwork.physics import DEFAULT_ENGINE, ENGINES
@@ -18,77 +20,133 @@ from footwork.study.plan import Job
 from footwork.tasks.task import SUCCESS_RADII
 from footwork.train import Experiment
 
-# What a narrow terminal does without, the first of these first.
-LEFT_OUT_FIRST = ("S", "needs", "task", "trains", "k", "peak MB", "compiling s", "to first\nupdate s", "decisions/s")
+PIPE_WIDTH = 200  # characters, where no terminal says how wide it is
 
 
-def show(*tables: Table) -> None:
-    """Print tables to standard output: a pipe gets all columns, a narrow terminal those that fit, no cell cut."""
-    console = Console()
+@dataclass(frozen=True)
+class Column:
+    """A column of a table."""
+
+    header: str
+    is_text: bool = False  # flush left, and it may wrap: else its cells are figures, flush right and whole
+    wraps: bool | None = None  # whether it may wrap; None: text does
+    spare: int = 0  # in which order a narrow terminal leaves it out, 1 first; 0: never
+
+    @property
+    def may_wrap(self) -> bool:
+        """Whether its cells may go on below."""
+        return self.is_text if self.wraps is None else self.wraps
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a table holds, before it is known how wide it may be."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: Sequence[tuple[str, ...]]
+    section_ends: Collection[int] = ()  # rows with a line below them
+    notes: Sequence[str] = ()  # lines below the table
+
+
+def show(*sheets: Sheet, console: Console | None = None) -> None:
+    """Print tables to standard output, no cell cut: all columns to a pipe, those that fit to a narrow terminal."""
+    console = Console() if console is None else console
     if not console.is_terminal:
-        console = Console(width=200)
-    for table in tables:
-        fit(table, console)
+        console.width = PIPE_WIDTH
+    for sheet in sheets:
+        table, left_out = fitted(sheet, console.width)
         console.print(table)
+        if left_out:
+            console.print(f"left out for want of width: {', '.join(left_out)}; a wider terminal or a pipe shows them")
+        for note in sheet.notes:
+            console.print(escape(note))
 
 
-def fit(table: Table, console: Console) -> None:
-    """Make a table fit the width of a console: fewer lines between its cells, then fewer columns, which are named."""
-    if _least_width(table, console) > console.width:
-        table.box, table.pad_edge, table.show_edge = box.SIMPLE_HEAD, False, False
-    left_out = []
-    for header in LEFT_OUT_FIRST:
-        if _least_width(table, console) <= console.width:
+def fitted(sheet: Sheet, width: int) -> tuple[Table, list[str]]:
+    """A table of at most ``width`` characters, and the headers of columns that it had to leave out.
+
+    What gives way first are lines between the cells, then spare columns. Text goes on below; where that is not enough,
+    in terminals of fewer than some 50 characters, cells are cut.
+    """
+    kept = list(range(len(sheet.columns)))
+    if _least_width(sheet, kept, framed=True) <= width:
+        return _table(sheet, kept, framed=True), []
+    left_out: list[int] = []
+    for i in sorted((i for i in kept if sheet.columns[i].spare), key=lambda i: sheet.columns[i].spare):
+        if _least_width(sheet, kept, framed=False) <= width:
             break
-        if any(column.header == header for column in table.columns):
-            table.columns = [column for column in table.columns if column.header != header]
-            left_out.append(header)
-    if left_out:
-        names = ", ".join(header.replace("\n", " ") for header in left_out)
-        table.caption = f"for want of width without: {names}"
-        table.caption_justify = "left"
+        kept.remove(i)
+        left_out.append(i)
+    for i in reversed(left_out):  # what fits beside those that stay after all
+        if _least_width(sheet, [*kept, i], framed=False) <= width:
+            kept.append(i)
+    missing = [column.header.replace("\n", " ") for i, column in enumerate(sheet.columns) if i not in kept]
+    return _table(sheet, sorted(kept), framed=False), missing
 
 
-def _least_width(table: Table, console: Console) -> int:
-    """Characters that a table takes if its columns are as narrow as they may be: whole cells, or words."""
-    unbound = console.options.update(width=100_000)
+def _least_width(sheet: Sheet, kept: Sequence[int], framed: bool) -> int:
+    """Characters that columns take at least: figures whole, of text the longest word, and what is between them."""
+    widths = []
+    for i in kept:
+        cells = (sheet.columns[i].header, *(row[i] for row in sheet.rows))
+        pieces = (
+            piece for cell in cells for piece in (cell.split() if sheet.columns[i].may_wrap else cell.split("\n"))
+        )
+        widths.append(max(map(cell_len, pieces), default=0))
+    return sum(widths) + (3 * len(kept) + 1 if framed else 3 * (len(kept) - 1))
 
-    def spare(column: Column) -> int:
-        if column.no_wrap:
-            return 0
-        sizes = [Measurement.get(console, unbound, text) for text in (column.header, *column.cells)]
-        return max(size.maximum for size in sizes) - max(size.minimum for size in sizes)
 
-    return Measurement.get(console, unbound, table).maximum - sum(spare(column) for column in table.columns)
+def _table(sheet: Sheet, kept: Sequence[int], framed: bool) -> Table:
+    table = Table(title=escape(sheet.title), title_justify="left")
+    if not framed:
+        table.box, table.pad_edge, table.show_edge = box.SIMPLE_HEAD, False, False
+    for i in kept:
+        column = sheet.columns[i]
+        table.add_column(
+            escape(column.header),
+            justify="left" if column.is_text else "right",
+            no_wrap=not column.may_wrap,
+            overflow="fold",
+        )
+    for number, row in enumerate(sheet.rows):
+        table.add_row(*(escape(row[i]) for i in kept), end_section=number in sheet.section_ends)
+    return table
 
 
-def rows_table(experiments: list[Experiment], found: dict[str, str], every_row: bool = False) -> Table:
+def rows_table(experiments: list[Experiment], found: dict[str, str], every_row: bool = False) -> Sheet:
     """What each row trains, on what, and whether trained policies are at hand; variations in short."""
-    title = "rows" if every_row else "rows (variations in short: --all shows them)"
-    table = Table(title=title, title_justify="left")
-    for column in ("row", "trains", "task", "needs", "S", "k", "control\nsteps", "trained"):
-        justify: Literal["left", "right"] = "right" if column in ("S", "k", "control\nsteps") else "left"
-        table.add_column(column, justify=justify, no_wrap=column not in ("row", "trained"), overflow="fold")
+    columns = (
+        Column("row", is_text=True),
+        Column("trains", is_text=True, wraps=False, spare=4),
+        Column("task", is_text=True, wraps=False, spare=3),
+        Column("needs", is_text=True, wraps=False, spare=2),
+        Column("S", spare=1),
+        Column("k", spare=5),
+        Column("control\nsteps"),
+        Column("trained", is_text=True),
+    )
     groups: dict[str, list[Experiment]] = {}
     for row in experiments:
         groups.setdefault(group_of(row.name), []).append(row)
-    last = ""
+    lines: list[tuple[str, ...]] = []
+    ends, last = [], ""
     for group, rows in groups.items():
         short = not every_row and _in_one_line(group)
         section = group.partition("/")[0] if short and not group.endswith("-penalised") else group
         if last and section != last:
-            table.add_section()
+            ends.append(len(lines) - 1)
         last = section
         if short and len(rows) > 1:
             values = ", ".join(row.name.rpartition("/")[2] for row in rows)
             name = f"{group}/{{{values}}}" if len(values) < 24 else f"{group}/... ({len(rows)})"
             trained = sum(bool(found[row.name]) for row in rows)
             cells = _row_cells(rows[0], name, f"{trained} of {len(rows)}" if trained else "")
-            table.add_row(*_where_they_agree(cells, [_row_cells(row, "", "") for row in rows]))
+            lines.append(_where_they_agree(cells, [_row_cells(row, "", "") for row in rows]))
             continue
-        for row in rows:
-            table.add_row(*_row_cells(row, row.name, found[row.name]))
-    return table
+        lines += [_row_cells(row, row.name, found[row.name]) for row in rows]
+    title = "rows" if every_row else "rows (variations in short: --all shows them)"
+    return Sheet(title, columns, lines, ends)
 
 
 def _in_one_line(group: str) -> bool:
@@ -113,7 +171,7 @@ def _row_cells(row: Experiment, name: str, found: str) -> tuple[str, ...]:
     return name, kind, row.task.name, row.needs or "", str(row.ppo.batch_size), k, steps, found
 
 
-def plan_table(taken: dict[Job, int], done: set[Job], size: str) -> Table:
+def plan_table(taken: dict[Job, int], done: set[Job], size: str) -> Sheet:
     """What a study would run, and how much of it is there: seeds and control steps of each row.
 
     Args:
@@ -124,42 +182,34 @@ def plan_table(taken: dict[Job, int], done: set[Job], size: str) -> Table:
     jobs, total = list(taken), sum(job.steps for job in taken)
     left = total - sum(taken.values())
     title = f"{size} study: {len(jobs)} runs, {total:,} control steps\n{len(done)} runs done, {left:,} steps to do"
-    table = Table(title=title, title_justify="left")
-    for column in ("row", "seeds\ndone", "control\nsteps"):
-        is_name = column == "row"
-        table.add_column(column, justify="left" if is_name else "right", no_wrap=not is_name, overflow="fold")
+    lines = []
     for row in dict.fromkeys(job.row for job in jobs):
         mine = [job for job in jobs if job.row == row]
         there = sum(job in done for job in mine)
-        table.add_row(row, f"{there} of {len(mine)}", f"{sum(job.steps for job in mine):,}")
-    return table
+        lines.append((row, f"{there} of {len(mine)}", f"{sum(job.steps for job in mine):,}"))
+    return Sheet(title, (Column("row", is_text=True), Column("seeds\ndone"), Column("control\nsteps")), lines)
 
 
-def claims_table(judgements: list[Judgement], size: str) -> Table:
+def claims_table(judgements: list[Judgement], size: str) -> Sheet:
     """Verdicts, one line per claim and setting."""
-    table = Table(title="claims" if size == "full" else f"claims ({size} study)", title_justify="left")
-    for column in ("", "claim", "where", "verdict", "because"):
-        table.add_column(column, justify="right" if column == "" else "left")
-    for j in judgements:
-        table.add_row(str(j.claim.number), j.claim.words, j.where, j.verdict, j.why)
-    return table
+    columns = (Column(""), *(Column(name, is_text=True) for name in ("claim", "where", "verdict", "because")))
+    lines = [(str(j.claim.number), j.claim.words, j.where, j.verdict, j.why) for j in judgements]
+    return Sheet("claims" if size == "full" else f"claims ({size} study)", columns, lines)
 
 
-def evaluation_table(reports: list[dict[str, Any]]) -> Table:
-    """Rows side by side, a line per figure: rates in per cent with their 95 % intervals."""
+def evaluation_table(reports: list[dict[str, Any]]) -> Sheet:
+    """One row or two side by side, a line per figure: rates in per cent with their 95 % intervals."""
     walkers = all(report["success"] is None for report in reports)
     lengths = " or ".join(str(steps) for steps in sorted({report["episode_steps"] for report in reports}))
-    title = f"evaluation, episodes of {lengths} control steps\n95 % intervals in brackets"
-    table = Table(title=title, title_justify="left")
-    table.add_column("", no_wrap=True)
-    for report in reports:
-        table.add_column(_played(report), justify="right", overflow="fold")
     within = [f"within {radius} m, %" for radius in SUCCESS_RADII]
     speeds = [f"{name}, m/s" for name in DIRECTIONS]
     names = ["episodes", *(speeds if walkers else within), "fall, %", "flip, %", "progress, m", "time to goal, s"]
-    for name, *cells in zip(names, *(_evaluation_cells(report, walkers) for report in reports), strict=True):
-        table.add_row(name, *cells)
-    return table
+    figures = (_evaluation_cells(report, walkers) for report in reports)
+    return Sheet(
+        f"evaluation, episodes of {lengths} control steps\n95 % intervals in brackets",
+        (Column("", is_text=True, wraps=False), *(Column(_played(report), wraps=True) for report in reports)),
+        list(zip(names, *figures, strict=True)),
+    )
 
 
 def _evaluation_cells(report: dict[str, Any], walkers: bool) -> list[str]:
@@ -181,29 +231,29 @@ def _evaluation_cells(report: dict[str, Any], walkers: bool) -> list[str]:
     ]
 
 
-def handover_table(report: dict[str, Any]) -> Table:
+def handover_table(report: dict[str, Any]) -> Sheet:
     """Who hands over to whom: speed after, falls, flips."""
-    table = Table(title=f"{_played(report)}: hand-over, m/s after (fall %, flip %)", title_justify="left")
-    table.add_column("from \\ to")
-    for name in DIRECTIONS:
-        table.add_column(name, justify="right", no_wrap=True)
-    for name, row in zip(DIRECTIONS, report["handover"], strict=True):
-        cells = (f"{c['speed_mps']:.2f} ({100 * c['fall']:.0f}, {100 * c['flip']:.0f})" for c in row)
-        table.add_row(name, *cells)
-    return table
+    columns = (
+        Column("from \\ to", is_text=True, wraps=False),
+        *(Column(name, wraps=True) for name in DIRECTIONS),
+    )
+    lines = [
+        (name, *(f"{c['speed_mps']:.2f} ({100 * c['fall']:.0f}, {100 * c['flip']:.0f})" for c in row))
+        for name, row in zip(DIRECTIONS, report["handover"], strict=True)
+    ]
+    return Sheet(f"{_played(report)}: hand-over, m/s after (fall %, flip %)", columns, lines)
 
 
-def switching_table(report: dict[str, Any]) -> Table:
+def switching_table(report: dict[str, Any]) -> Sheet:
     """Random switching, one line per period."""
     how = " between orthogonal directions" if report["orthogonal"] else ""
     title = f"{_played(report)}:\nrandom switching{how} for 2000 control steps"
-    table = Table(title=title, title_justify="left")
-    for column in ("k", "m/s per option", "idle %", "upside down %", "fallen %"):
-        table.add_column(column, justify="right", no_wrap=True)
+    columns = (Column("k"), *(Column(name) for name in ("m/s per\noption", "idle %", "upside\ndown %", "fallen %")))
+    lines = []
     for k, figures in report["switching"].items():
         shares = (f"{100 * figures[name]:.1f}" for name in ("idle", "upside_down", "fallen"))
-        table.add_row(k, f"{figures['speed_mps']:.2f}", *shares)
-    return table
+        lines.append((k, f"{figures['speed_mps']:.2f}", *shares))
+    return Sheet(title, columns, lines)
 
 
 def _played(report: dict[str, Any]) -> str:
@@ -213,7 +263,7 @@ def _played(report: dict[str, Any]) -> str:
     return row if engine == own else f"{row} on {engine}"
 
 
-def bench_tables(report: dict[str, Any]) -> list[Table]:
+def bench_tables(report: dict[str, Any]) -> list[Sheet]:
     """Contestants, what was asked for, and how cost grows."""
     machine = report["machine"]
     note = f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB, load {machine['load']}"
@@ -222,52 +272,72 @@ def bench_tables(report: dict[str, Any]) -> list[Table]:
     return [*found, *(_growth_table(axis, points) for axis, points in report["growth"].items())]
 
 
-def _contestants_table(contestants: dict[str, Any], note: str) -> Table:
-    table = Table(title=f"control steps per second, median (least, largest)\n{note}", title_justify="left")
-    table.add_column("contestant", overflow="fold")
-    for name in ("steps/s", "decisions/s", "over its\nphysics", "to first\nupdate s", "compiling s", "peak MB"):
-        table.add_column(name, justify="right", no_wrap=True)
+COSTS = (
+    Column("to first\nupdate s", spare=3),
+    Column("compiling s", spare=2),
+    Column("peak MB", spare=1),
+)  # of a contestant or a point
+
+
+def _contestants_table(contestants: dict[str, Any], note: str) -> Sheet:
+    names = (Column("contestant", is_text=True), Column("steps/s"), Column("decisions/s", spare=4))
+    lines = []
     for name, record in contestants.items():
-        if "skipped" in record:
-            table.add_row(escape(f"{name}: skipped: {record['skipped']}"))
-            continue
         rates = (_spread(record.get(key), form) for key, form in CONTESTANT_FIGURES)
-        table.add_row(name, *rates, *(_number(record.get(key)) for key in ("start_s", "compile_s", "peak_mb")))
-    return table
+        lines.append((name, *rates, *_costs(record)) if "skipped" not in record else _skipped(name, len(COSTS) + 3))
+    return Sheet(
+        f"control steps per second, median (least, largest)\n{note}",
+        (*names, Column("over its\nphysics"), *COSTS),
+        lines,
+        notes=[f"{name}: skipped: {record['skipped']}" for name, record in contestants.items() if "skipped" in record],
+    )
 
 
 CONTESTANT_FIGURES = (("steps_per_second", ",.0f"), ("decisions_per_second", ",.0f"), ("over_engine", ".2f"))
 
 
-def _targets_table(report: dict[str, Any]) -> Table:
-    table = Table(title="ratios, within each round", title_justify="left")
-    for name in ("figure", "median\n(least, largest)", "asked\nfor", "reached"):
-        is_name = name == "figure"
-        table.add_column(name, justify="left" if is_name else "right", no_wrap=not is_name, overflow="fold")
+def _targets_table(report: dict[str, Any]) -> Sheet:
+    columns = (
+        Column("figure", is_text=True),
+        Column("median\n(least, largest)"),
+        Column("asked\nfor"),
+        Column("reached"),
+    )
     figures = {**{key: report[key] for key in report["targets"]}, "compile_s": report["compile_s"]}
+    lines = []
     for key in {**figures, "peak_mb": 0, **report["ratios"]}:
         if report.get(key) is None:
             continue
         ratio, target = report["ratios"].get(key), report["targets"].get(key, {"asked": "", "reached": None})
         shown = _number(report[key], ".2f") if ratio is None else _spread(ratio, ".2f")
-        table.add_row(key, shown, target["asked"], {True: "yes", False: "no", None: ""}[target["reached"]])
-    return table
+        lines.append((key, shown, target["asked"], {True: "yes", False: "no", None: ""}[target["reached"]]))
+    return Sheet("ratios, within each round", columns, lines)
 
 
-def _growth_table(axis: str, points: list[dict[str, Any]]) -> Table:
-    table = Table(title=f"how cost grows with {axis}", title_justify="left")
-    table.add_column(axis, overflow="fold")
-    for name in ("steps/s", "over\nphysics alone", "to first\nupdate s", "compiling s", "peak MB"):
-        table.add_column(name, justify="right", no_wrap=True)
+def _growth_table(axis: str, points: list[dict[str, Any]]) -> Sheet:
+    lines = []
     for point in points:
+        size = str(point["size"])
         if "skipped" in point:
-            table.add_row(escape(f"{point['size']}: skipped: {point['skipped']}"))
+            lines.append(_skipped(size, len(COSTS) + 2))
             continue
         rates = (_spread(point["steps_per_second"], ",.0f"), _spread(point["over_reference"], ".2f"))
-        table.add_row(
-            str(point["size"]), *rates, *(_number(point.get(key)) for key in ("start_s", "compile_s", "peak_mb"))
-        )
-    return table
+        lines.append((size, *rates, *_costs(point)))
+    return Sheet(
+        f"how cost grows with {axis}",
+        (Column(axis), Column("steps/s"), Column("over\nphysics alone"), *COSTS),
+        lines,
+        notes=[f"{axis} {point['size']}: skipped: {point['skipped']}" for point in points if "skipped" in point],
+    )
+
+
+def _skipped(name: str, cells: int) -> tuple[str, ...]:
+    """The line of something that was not measured; why stands below the table."""
+    return (name, "skipped", *("" for _ in range(cells - 1)))
+
+
+def _costs(record: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(_number(record.get(key)) for key in ("start_s", "compile_s", "peak_mb"))
 
 
 def _spread(figures: dict[str, Any] | None, form: str) -> str:

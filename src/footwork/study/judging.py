@@ -22,9 +22,11 @@ from footwork.statistics import (
 )
 from footwork.study.claims import CLAIMS, Claim, Contrast, Rule, Setting, Verdict, settings_of
 from footwork.study.experiments import SCHEDULES, find_row, in_braces, is_row
-from footwork.study.measure import EVALUATION, STUCK_WITHIN, straight_line_stop
+from footwork.study.measure import EVALUATION, straight_line_stop
 from footwork.study.metrics import METRICS
 from footwork.study.results import Results, prefixes_at_hand, seeds_in_words
+
+ROOM_AT_WALL = 0.25  # m: so much nearer to the goal than where the straight line ends an ant may stand at the wall
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Finding:
     verdict: Verdict
     so_far: Verdict  # what the rule says if the number of seeds is not asked for
     room: float | None = None  # the most that a difference of shares could be: what the other row leaves
-    at_wall: bool = False  # room ends where the straight line meets a wall: nobody on either side ended nearer
+    at_wall: bool = False  # room ends where the straight line meets a wall: nobody ended nearer, but for ROOM_AT_WALL
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def _find(results: Results, claim: Claim, what: Contrast, setting: Setting) -> F
 def _way_to_wall(results: Results, what: Contrast, rows: Sequence[str]) -> float | None:
     """The share of the way at which the straight line meets a wall, if no episode ended nearer to the goal than that.
 
-    Within a metre, since the ant's body and the place where it stands along the wall leave some room.
+    But for :data:`ROOM_AT_WALL`, since where the ant stands along the wall leaves some room.
     """
     arena = find_row(rows[0]).task.arena
     stop = straight_line_stop(arena) if what.metric == "way" else None
@@ -123,7 +125,7 @@ def _way_to_wall(results: Results, what: Contrast, rows: Sequence[str]) -> float
     for row in rows:
         for entry in results.measurements(row, EVALUATION):
             ends = np.array(entry["ends"], np.float64)
-            if (np.hypot(*(ends - np.array(arena.goals[0])).T) < left - STUCK_WITHIN).any():
+            if (np.hypot(*(ends - np.array(arena.goals[0])).T) < left - ROOM_AT_WALL).any():
                 return None
     return 1.0 - left / whole
 
@@ -248,7 +250,8 @@ def no_room(finding: Finding) -> str:
         return ""
     if finding.at_wall:
         points = 100 * max(finding.room, 0.0)
-        return f"about {points:.1f} points were possible up to the wall, and nobody ended a metre nearer than that"
+        nobody = f"no episode ended over {ROOM_AT_WALL:g} m nearer to the goal"
+        return f"about {points:.1f} points were possible up to the wall, and {nobody}"
     return f"no more than {100 * finding.room:.1f} points were possible"
 
 

@@ -371,13 +371,13 @@ def _made(results: Results, rows: Sequence[str], command: str) -> list[Block]:
             f"source {source_digest()}. Where something has two versions here, not all runs are of one make."
         ),
         TableBlock(("version of", "is", "runs"), versions),
-        Text("Which runs were made at which commit, with all seeds of a row where none are named:"),
+        Text("Which runs were made at which commit:"),
         _commits_table(results, rows),
     ]
 
 
 def _commits_table(results: Results, rows: Sequence[str]) -> TableBlock:
-    """The commit of each run, most runs first."""
+    """The commit of each run, a line per choice of seeds; those with most runs first."""
     made: dict[str, dict[str, list[int]]] = {}
     for row in rows:
         for sample in results.samples(row):
@@ -388,12 +388,14 @@ def _commits_table(results: Results, rows: Sequence[str]) -> TableBlock:
         groups: dict[str, list[str]] = {}
         for row, seeds in theirs.items():
             whole = len(seeds) == len(results.samples(row))
-            name = f" (seed{'s' * (len(seeds) > 1)} {', '.join(map(str, sorted(seeds)))})"
-            groups.setdefault("" if whole else name, []).append(row)
-        count = sum(map(len, theirs.values()))
-        lines.append((count, commit, "; ".join(f"{in_braces(group)}{seeds}" for seeds, group in groups.items())))
-    table = ((commit, str(count), said) for count, commit, said in sorted(lines, key=lambda line: -line[0]))
-    return TableBlock(("commit", "runs", "rows"), tuple(table))
+            groups.setdefault("all" if whole else ", ".join(map(str, sorted(seeds))), []).append(row)
+        total = sum(map(len, theirs.values()))
+        lines += [
+            ((-total, commit), (commit, seeds, str(sum(len(theirs[row]) for row in group)), in_braces(group)))
+            for seeds, group in sorted(groups.items(), key=lambda item: (item[0] != "all", item[0]))
+        ]
+    table = tuple(line for _, line in sorted(lines, key=lambda item: item[0]))
+    return TableBlock(("commit", "seeds", "runs", "rows"), table)
 
 
 def _trained_together(results: Results, row: str) -> list[list[int]]:

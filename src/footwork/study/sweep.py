@@ -440,7 +440,7 @@ def _display(board: Board, log: Callable[[str], None]) -> Iterator[Display]:
 
 
 def board_table(board: Board) -> Any:
-    """Rows with something to do or to report: seeds done, how far the running ones are; fits 80 characters."""
+    """Rows with something to do or to report: seeds done, how far the running ones are; fits 60 characters."""
     from rich import box
     from rich.table import Table
 

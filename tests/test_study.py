@@ -1349,8 +1349,8 @@ def test_a_plan_says_what_is_done(study, capsys):
     said = capsys.readouterr().out
     assert "6 runs, " in said
     assert "2 runs done, " in said
-    assert re.search(r"walker/plain +│ +3 │ +2 │", said)
-    assert re.search(r"walker/random-start +│ +3 │ +0 │", said)
+    assert re.search(r"walker/plain +│ +2 of 3 │", said)
+    assert re.search(r"walker/random-start +│ +0 of 3 │", said)
     one = planned_steps(find_row("walker/plain")) * 4
     assert f" {4 * one:,} steps to do" in said
     (run_path(study.runs, "walker/plain", (1,)) / "transitions.json").unlink()  # measuring is left of it
